@@ -1,0 +1,365 @@
+"""Read bags: messages in log-time order, or a topic's fields as NumPy columns."""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections import deque
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+import numpy as np
+
+from tdof_npid_ros.bag import metadata
+from tdof_npid_ros.bag.cdr import decode
+from tdof_npid_ros.bag.columns import ColumnBuilder, Columns
+from tdof_npid_ros.bag.definition import Definition, parse
+from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.mcap_file import McapFile
+from tdof_npid_ros.bag.scan import Table
+from tdof_npid_ros.bag.sqlite_file import SqliteFile
+from tdof_npid_ros.bag.storage import Piece, Storage, TopicInfo
+
+Message = tuple[str, int, int, memoryview]  # topic, log time, publish time, CDR
+
+LAST_NS: Final = 2**63 - 1
+
+_MAX_OPEN_BYTES: Final = (
+    1 << 30
+)  # of pieces that overlap in time, read at once to put their messages in order
+_SUFFIXES: Final = (".mcap", ".db3")
+
+
+def bag_files(path: Path) -> list[Path]:
+    """Return the files of a bag: of a folder the `.mcap` or `.db3` files in the order they were written.
+
+    Raises
+    ------
+    BagError
+        There is no bag at this path.
+    """
+    if path.is_file():
+        return [path]
+    try:
+        files = [file for file in path.iterdir() if file.suffix in _SUFFIXES and file.is_file()]
+    except OSError as error:
+        raise BagError(f"cannot open {path}: {error.strerror}: give a bag folder or a file") from None
+    if not files:
+        raise BagError(f"{path}: no .mcap or .db3 file in it: give a bag folder or a file")
+    return sorted(
+        files, key=lambda file: [int(part) if part.isdigit() else part for part in _split_digits(file.name)]
+    )
+
+
+def _split_digits(name: str) -> list[str]:
+    return re.split(r"([0-9]+)", name)
+
+
+class BagReader:
+    """One or more bags, read as one. Use it as a context manager.
+
+    Attributes
+    ----------
+    topics
+        `TopicInfo` by name, counts summed over all files.
+    start_ns, end_ns
+        Log times of the first and last message; both 0 when there is none.
+    metadata
+        Named records of key-value pairs (`BagWriter.write_metadata`), in order.
+    custom_data
+        What `metadata.yaml` holds for users.
+    truncated
+        Whether a file ends before its end, as after a crash. What it holds is read all the same.
+    missing
+        What the truncated files lack, a line for each thing.
+    """
+
+    def __init__(self, *paths: str | Path) -> None:
+        """Open bag folders, `.mcap` and `.db3` files.
+
+        Raises
+        ------
+        BagError
+            A path is no bag, or a file is damaged. That a recording was cut off is no error.
+        """
+        self.topics: dict[str, TopicInfo] = {}
+        self.metadata: list[tuple[str, dict[str, str]]] = []
+        self.custom_data: dict[str, str] = {}
+        self.missing: list[str] = []
+        self._files: list[Storage] = []
+        try:
+            for path in map(Path, paths):
+                self._open(path)
+        except BaseException:
+            self.close()
+            raise
+        if not self._files:
+            raise BagError("no bag to read: give at least one bag folder or file")
+        filled = [file for file in self._files if any(topic.count for topic in file.topics.values())]
+        self.start_ns = min((file.start_ns for file in filled), default=0)
+        self.end_ns = max((file.end_ns for file in filled), default=0)
+
+    @property
+    def truncated(self) -> bool:
+        """Whether something is missing."""
+        return bool(self.missing)
+
+    def close(self) -> None:
+        """Close the files."""
+        while self._files:
+            self._files.pop().close()
+
+    def __enter__(self) -> BagReader:
+        """Return the reader."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, start_ns: int = 0, stop_ns: int = LAST_NS
+    ) -> Iterator[Message]:
+        """Yield messages in log-time order, those of equal times in the order of the files.
+
+        Parameters
+        ----------
+        topics
+            By default all.
+        start_ns, stop_ns
+            Log times to begin with and to end before.
+
+        Yields
+        ------
+        Topic, log time and publish time in nanoseconds, and the serialized message (a view, 4-byte head
+        included).
+
+        Raises
+        ------
+        BagError
+            There is no such topic, or the bag is damaged.
+        """
+        wanted = frozenset(self.topics if topics is None else topics)
+        for topic in wanted:
+            self._topic(topic)
+        waiting = deque(
+            sorted(
+                (
+                    (piece, file)
+                    for file in self._files
+                    if wanted & file.topics.keys()
+                    for piece in file.pieces()
+                    if piece.end_ns >= start_ns and piece.start_ns < stop_ns
+                ),
+                key=lambda item: item[0].start_ns,
+            )
+        )
+        return _merge(waiting, wanted, start_ns, stop_ns)
+
+    def columns(self, topic: str, fields: Sequence[str] | None = None) -> Columns:
+        """Return a topic's messages as arrays by field path, in log-time order.
+
+        Parameters
+        ----------
+        topic
+            Its name.
+        fields
+            Flattened paths such as "position" or "header.frame_id", by default all. A stamp can be read
+            whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", "header.stamp.nanosec").
+
+        Returns
+        -------
+        "log_time" and "publish_time" (int64, nanoseconds), and for each field, with n messages:
+
+        * a number: shape (n,), its own type;
+        * an array of numbers, of the same length m in all messages: shape (n, m);
+        * a string: shape (n,), NumPy `str`; an array of m strings: shape (n, m);
+        * anything else, that is arrays whose lengths vary, arrays of messages (as lists of dicts), and
+        strings of
+          very different lengths: shape (n,), objects.
+
+        Raises
+        ------
+        BagError
+            There is no such topic or field, the bag is damaged, or the columns need more memory than is free.
+        """
+        builder = ColumnBuilder(self._definition(topic), fields, f"topic {topic}", self.topics[topic].count)
+        limit = _free_memory_bytes()
+        try:
+            for file in self._files:
+                if topic in file.topics:
+                    self._add_columns(builder, file, topic, limit)
+            return builder.finish()
+        except MemoryError:
+            raise BagError(
+                f"topic {topic}: its columns need more memory than there is: read fewer fields"
+            ) from None
+
+    def decode(self, topic: str, data: bytes | bytearray | memoryview) -> dict[str, Any]:
+        """Return one message of a topic as a dict; see `cdr.decode`.
+
+        Raises
+        ------
+        BagError
+            There is no such topic, or the message or the definition is damaged.
+        """
+        self._definition(topic)
+        info = self.topics[topic]
+        return decode(info.type, info.definition, data)
+
+    def _open(self, path: Path) -> None:
+        if path.is_dir():
+            information = metadata.read_information(path)
+            mode = information.get("compression_mode")
+            if mode and str(mode).upper() != "NONE":
+                raise BagError(
+                    f"{path}: is compressed by rosbag2 ({mode}): unpack it with `ros2 bag convert`"
+                )
+            custom = information.get("custom_data")
+            if isinstance(custom, dict):
+                self.custom_data.update({str(key): str(value) for key, value in custom.items()})
+        for name in bag_files(path):
+            file: Storage = SqliteFile(name) if name.suffix == ".db3" else McapFile(name)
+            self._files.append(file)
+            self.metadata.extend(file.metadata)
+            self.missing.extend(file.missing)
+            for topic in file.topics.values():
+                known = self.topics.setdefault(topic.name, replace(topic, count=0))
+                if known.type != topic.type:
+                    raise BagError(
+                        f"{name}: topic {topic.name} is of type {topic.type}, elsewhere {known.type}: read"
+                        " them apart"
+                    )
+                self.topics[topic.name] = replace(known, count=known.count + topic.count)
+
+    def _topic(self, topic: str) -> TopicInfo:
+        if topic not in self.topics:
+            raise BagError(
+                f"no topic {topic!r} in the bag: choose from {', '.join(sorted(self.topics)) or 'none'}"
+            )
+        return self.topics[topic]
+
+    def _definition(self, topic: str) -> Definition:
+        """Return what the files agree that a topic's messages are."""
+        self._topic(topic)
+        agreed: Definition | None = None
+        for file in self._files:
+            info = file.topics.get(topic)
+            if info is None:
+                continue
+            if info.encoding != "ros2msg":
+                raise BagError(
+                    f"{file.name}: topic {topic} is in {info.encoding or 'an unknown format'}, not CDR with a"
+                    " definition in ros2msg: its messages cannot be decoded"
+                )
+            definition = parse(info.type, info.definition)
+            if agreed is not None and definition.types != agreed.types:
+                raise BagError(
+                    f"{file.name}: topic {topic} has other fields than in the files before: read them apart"
+                )
+            agreed = definition
+        assert agreed is not None
+        return agreed
+
+    def _add_columns(self, builder: ColumnBuilder, file: Storage, topic: str, limit: int) -> None:
+        before = builder.count
+        channels = np.array([number for number, name in file.topic_of.items() if name == topic])
+        for piece in file.pieces():
+            table = piece.load()
+            mine = table.channel == channels[0] if channels.size == 1 else np.isin(table.channel, channels)
+            if mine.any():
+                builder.add(table if mine.all() else table.only(mine))
+            if builder.size > limit:
+                raise BagError(
+                    f"topic {topic}: its columns need more than the {limit >> 20} MiB of memory that are"
+                    " free: read fewer fields"
+                )
+        if builder.count - before != file.topics[topic].count:
+            raise BagError(
+                f"{file.name}: {builder.count - before} messages of topic {topic} where the summary says"
+                f" {file.topics[topic].count}: the file is damaged, run `tdof-npid recover`"
+            )
+
+
+def _free_memory_bytes() -> int:
+    """Return how much columns may take: what the system has left, as half of it may be needed to join"
+    " them."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024 // 2
+    except (OSError, ValueError):
+        pass
+    return 2**63
+
+
+def _rows(
+    table: Table, file: Storage, wanted: frozenset[str], start_ns: int, stop_ns: int
+) -> Iterator[Message]:
+    """Yield the wanted messages of a table in log-time order."""
+    times = table.log_time
+    names = file.topic_of
+    mine = (times >= start_ns) & (times < stop_ns)
+    foreign = [number for number, name in names.items() if name not in wanted]
+    if foreign:
+        mine &= ~np.isin(table.channel, foreign)
+    if not mine.all():
+        table = table.only(mine)
+    if (table.log_time[1:] < table.log_time[:-1]).any():
+        table = table.only(np.argsort(table.log_time, kind="stable"))
+    data = table.data.data.toreadonly()
+    for channel, log_time, publish_time, offset, length in zip(
+        table.channel.tolist(),
+        table.log_time.tolist(),
+        table.publish_time.tolist(),
+        table.offset.tolist(),
+        table.length.tolist(),
+        strict=True,
+    ):
+        yield names[channel], log_time, publish_time, data[offset : offset + length]
+
+
+def _merge(
+    waiting: deque[tuple[Piece, Storage]], wanted: frozenset[str], start_ns: int, stop_ns: int
+) -> Iterator[Message]:
+    """Yield the messages of pieces, which come sorted by their start, in log-time order.
+
+    A piece is loaded when its turn comes, and forgotten when it is read.
+    """
+    running: list[tuple[int, int, Message, Iterator[Message], int]] = []
+    number = 0
+    open_bytes = 0
+    while running or waiting:
+        if waiting and (not running or waiting[0][0].start_ns <= running[0][0]):
+            piece, file = waiting.popleft()
+            table = piece.load()
+            rows = _rows(table, file, wanted, start_ns, stop_ns)
+            if not running and (not waiting or waiting[0][0].start_ns > piece.end_ns):
+                yield from rows  # no other piece lies in its time
+                continue
+            open_bytes += table.data.nbytes
+            if open_bytes > _MAX_OPEN_BYTES:
+                raise BagError(
+                    f"{file.name}: more than {_MAX_OPEN_BYTES >> 20} MiB of chunks lie in one time: put"
+                    " the bag in order with `tdof-npid recover`"
+                )
+            first = next(rows, None)
+            if first is not None:
+                heapq.heappush(running, (first[1], number, first, rows, table.data.nbytes))
+                number += 1
+            else:
+                open_bytes -= table.data.nbytes
+            continue
+        _, order, message, rows, size = running[0]
+        yield message
+        following = next(rows, None)
+        if following is None:
+            heapq.heappop(running)
+            open_bytes -= size
+        else:
+            heapq.heapreplace(running, (following[1], order, following, rows, size))

@@ -1,0 +1,99 @@
+"""Message definitions and type hashes, from the interface packages installed on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from tdof_npid_ros.bag.definition import PRIMITIVES, STRING
+from tdof_npid_ros.bag.errors import BagError
+
+SEPARATOR: Final = "=" * 80
+
+_PRIMITIVES: Final = frozenset((*PRIMITIVES, STRING, "wstring"))
+_FIELD: Final = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]", re.MULTILINE)
+_NAME: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:/(msg|srv|action))?/([A-Za-z][A-Za-z0-9_]*)")
+
+
+def _share_folders() -> Iterator[Path]:
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix:
+            yield Path(prefix) / "share"
+    yield Path(sys.prefix) / "share"
+
+
+def _interface_file(type_name: str, suffix: str) -> Path:
+    match = _NAME.fullmatch(type_name)
+    if match is None:
+        raise BagError(f"{type_name!r} is no message type: write it as package/msg/Type")
+    package, kind, name = match.groups()
+    for share in _share_folders():
+        path = share / package / (kind or "msg") / f"{name}{suffix}"
+        if path.is_file():
+            return path
+    raise BagError(
+        f"message type {type_name!r} is not installed: no {package}/{kind or 'msg'}/{name}{suffix} under"
+        f" AMENT_PREFIX_PATH or {sys.prefix}/share; install the package {package!r}"
+    )
+
+
+def _dependencies(definition: str, package: str) -> list[str]:
+    names = {name for name in _FIELD.findall(definition) if name not in _PRIMITIVES}
+    return sorted(name if "/" in name else f"{package}/{name}" for name in names)
+
+
+@cache
+def definition(type_name: str) -> str:
+    """Return the full definition of a type, all nested types included, as rosbag2 stores it (`ros2msg`).
+
+    Parameters
+    ----------
+    type_name
+        For example "sensor_msgs/msg/JointState".
+
+    Raises
+    ------
+    BagError
+        The type, or one it contains, is not installed or cannot be read.
+    """
+    seen: set[str] = set()
+
+    def expand(name: str) -> str:
+        path = _interface_file(name, ".msg")
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise BagError(f"cannot read {path}: {error}; install its package again") from None
+        parts = [text]
+        for nested in _dependencies(text, name.split("/")[0]):
+            if nested not in seen:
+                seen.add(nested)
+                parts.append(f"\n{SEPARATOR}\nMSG: {nested}\n{expand(nested)}")
+        return "".join(parts)
+
+    return expand(type_name)
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """Return the RIHS01 hash of a type, for example "RIHS01_a13e…".
+
+    Raises
+    ------
+    BagError
+        The type is not installed, or its description file is damaged.
+    """
+    path = _interface_file(type_name, ".json")
+    try:
+        hashes = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
+        return next(str(entry["hash_string"]) for entry in hashes if entry["type_name"] == type_name)
+    except (OSError, ValueError, KeyError, TypeError, StopIteration):
+        raise BagError(
+            f"cannot read the type hash of {type_name!r} from {path}: install its package again"
+        ) from None

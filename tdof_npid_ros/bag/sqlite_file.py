@@ -1,0 +1,152 @@
+"""Read a bag in rosbag2's SQLite storage (`.db3`)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tdof_npid_ros.bag.decompress import MAX_CHUNK_BYTES
+from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.scan import Table
+from tdof_npid_ros.bag.storage import Piece, TopicInfo
+
+_PIECE_MESSAGES: Final = 8192
+_NEEDED: Final = {"topics", "messages"}
+
+
+class SqliteFile:
+    """An open `.db3` file: a `Storage`. Publish times are the log times, the only ones it holds."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises
+        ------
+        BagError
+            It cannot be read, or is no bag.
+        """
+        self.path = path
+        self.name = str(path)
+        self.topics: dict[str, TopicInfo] = {}
+        self.metadata: list[tuple[str, dict[str, str]]] = []
+        self.missing: list[str] = []
+        self._names: dict[int, str] = {}
+        if not path.is_file():
+            raise BagError(f"cannot open {path}: no such file")
+        try:
+            uri = f"{path.resolve().as_uri()}?mode=ro"
+            self._database = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise BagError(f"cannot open {path}: {error}") from None
+        try:
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+            self._query("PRAGMA trusted_schema = OFF")
+            self._open()
+        except BaseException:
+            self._database.close()
+            raise
+
+    @property
+    def topic_of(self) -> Mapping[int, str]:
+        """Return topic names by channel number."""
+        return self._names
+
+    def pieces(self) -> list[Piece]:
+        """Return the messages in pieces that do not overlap in time, so far as equal times allow."""
+        starts = [*self._starts, self.end_ns + 1]
+        return [Piece(start, end - 1, partial(self._load, start, end)) for start, end in pairwise(starts)]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def _query(self, query: str, arguments: Sequence[int] = ()) -> list[tuple[Any, ...]]:
+        try:
+            return self._database.execute(query, arguments).fetchall()
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError, MemoryError) as error:
+            raise BagError(
+                f"{self.path}: cannot be read ({error}): it is damaged or no bag, try sqlite3's `.recover`"
+            ) from None
+
+    def _open(self) -> None:
+        tables = {name for (name,) in self._query("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not tables >= _NEEDED:
+            raise BagError(f"{self.path}: has no tables `topics` and `messages`: it is no bag")
+        columns = {str(row[1]) for row in self._query("PRAGMA table_info(topics)")}
+        definitions = self._definitions() if "message_definitions" in tables else {}
+        counts = dict(self._query("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        wanted = [
+            "id",
+            "name",
+            "type",
+            "serialization_format",
+            "offered_qos_profiles",
+            "type_description_hash",
+        ]
+        chosen = ", ".join(name if name in columns else "''" for name in wanted)
+        for number, name, type_name, serialization, qos, digest in self._query(
+            f"SELECT {chosen} FROM topics"
+        ):
+            if not isinstance(number, int) or not 0 <= number < 2**16:
+                raise BagError(f"{self.path}: topic number {str(number)[:20]!r} is none: the file is damaged")
+            encoding, text = definitions.get(type_name, ("", ""))
+            values = (name, type_name, serialization, qos, digest, encoding, text)
+            if not all(isinstance(value, str) for value in values) or name in self.topics:
+                raise BagError(f"{self.path}: its table of topics is damaged, or names one twice")
+            self._names[number] = name
+            self.topics[name] = TopicInfo(
+                name,
+                type_name,
+                counts.get(number, 0),
+                text,
+                encoding if serialization == "cdr" else serialization,
+                qos,
+                digest,
+            )
+        if counts.keys() - self._names.keys():
+            raise BagError(f"{self.path}: holds messages of a topic that is not listed: the file is damaged")
+        self._find_pieces()
+
+    def _definitions(self) -> dict[Any, tuple[Any, Any]]:
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        return {name: (encoding, text) for name, encoding, text in self._query(query)}
+
+    def _find_pieces(self) -> None:
+        try:
+            rows = self._database.execute("SELECT timestamp FROM messages ORDER BY timestamp")
+            times = np.fromiter((row[0] for row in rows), np.int64)
+        except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
+            raise BagError(f"{self.path}: its times cannot be read ({error}): the file is damaged") from None
+        if times.size and (times[0] < 0 or times[-1] == 2**63 - 1):
+            raise BagError(
+                f"{self.path}: a message's time is before 1970 or beyond 2262: the file is damaged"
+            )
+        self.start_ns = int(times[0]) if times.size else 0
+        self.end_ns = int(times[-1]) if times.size else 0
+        self._starts = np.unique(times[::_PIECE_MESSAGES]).tolist()
+
+    def _load(self, start: int, end: int) -> Table:
+        query = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp < ?"
+            " ORDER BY timestamp, id"
+        )
+        rows = self._query(query, (start, end))
+        if not all(isinstance(data, bytes) and isinstance(time, int) for _, time, data in rows):
+            raise BagError(f"{self.path}: a message at {start} ns or later is no bytes: the file is damaged")
+        length = np.array([len(data) for _, _, data in rows], np.int64)
+        log_time = np.array([time for _, time, _ in rows], np.int64)
+        return Table(
+            np.frombuffer(b"".join(data for _, _, data in rows), np.uint8),
+            np.array([number for number, _, _ in rows], np.uint16),
+            np.zeros(len(rows), np.uint32),
+            log_time,
+            log_time,
+            np.cumsum(length) - length,
+            length,
+        )

@@ -1,0 +1,229 @@
+"""A case: plant, controller and scenario of one ROS parameter file, as values that run in process."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tdof_npid_ros import loop
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType, Gains, gains_from_mapping
+from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
+from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
+from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
+from tdof_npid_ros.plants.plant import Plant, PlantError
+from tdof_npid_ros.scenario import Plan, PlanError, Signals, parse_plan
+
+DEFAULT_SAMPLE_PERIOD = 0.01  # s
+Bounds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A closed loop to run: what is in a parameter file.
+
+    Attributes:
+        name: for messages and tables.
+        sample_period_ns: of the loop.
+        model: the plant's model, and `plant_values` its parameters.
+        effort_limits: the plant's own limits on the effort.
+        gains: the controller's.
+        episodes: the scenario's lines by episode, in the order in which they run.
+        bounds: of the tuner's search, by gain.
+        weight: w of the objective (10).
+    """
+
+    name: str
+    sample_period_ns: int
+    model: str
+    plant_values: Mapping[str, Any]
+    effort_limits: tuple[float, float]
+    gains: Gains
+    episodes: Mapping[str, tuple[str, ...]]
+    bounds: Mapping[str, Bounds] = field(default_factory=dict)
+    weight: float = 1.0
+
+    @property
+    def sample_period(self) -> float:
+        """In s."""
+        return self.sample_period_ns / 1e9
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The plant as configured."""
+        return self.plant_at({})
+
+    def plant_at(self, changes: Mapping[str, float]) -> Plant:
+        """The plant with some parameters changed."""
+        return make_plant(self.model, {**self.plant_values, **changes})
+
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
+        """The plan of each episode.
+
+        Raises:
+            PlanError: a line is wrong; the message names the episode and the line.
+        """
+        changeable = changeable_parameters(self.model, self.plant_values)
+        plans = {}
+        for name, lines in self.episodes.items():
+            try:
+                plans[name] = parse_plan(lines, self.sample_period_ns, changeable)
+            except PlanError as error:
+                raise PlanError(f"{self.name}, episode {name!r}: {error}") from None
+        return plans
+
+    @cached_property
+    def signals(self) -> dict[str, Signals]:
+        """The plan of each episode, sampled."""
+        return {name: plan.sampled(self.sample_period_ns) for name, plan in self.plans.items()}
+
+    def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
+        """Run an episode in process; gains for one lane or many, by default the case's."""
+        return loop.simulate(self.plant_at, gains or self.gains, self.signals[episode], self.effort_limits)
+
+    def integrals(self, episode: str, gains: Gains) -> loop.Integrals:
+        """Run an episode in process and keep only its integrals."""
+        return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
+
+    def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:
+        """Metrics of the episode `setpoint`: a step of the setpoint at its start."""
+        y, signals = self.simulate("setpoint", gains).output[:, 0], self.signals["setpoint"]
+        return setpoint_metrics(y, 0.0, float(signals.setpoint[-1]), self.sample_period)
+
+    def disturbance_response(self, gains: Gains | None = None) -> DisturbanceMetrics:
+        """Metrics of the episode `disturbance`: a step of the disturbance at its start, the setpoint held."""
+        y, signals = self.simulate("disturbance", gains).output[:, 0], self.signals["disturbance"]
+        return disturbance_metrics(y, float(signals.setpoint[-1]), self.sample_period)
+
+
+def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
+    """The plant's parameters that may change while the loop runs, with their configured values."""
+    return {
+        name: float(values.get(name, default))
+        for name, default in model_parameters(model).items()
+        if name not in FIXED_WHILE_RUNNING and not isinstance(default, list)
+    }
+
+
+def sample_period_in_ns(value: Any) -> int:
+    """A sample period in s as a whole number of nanoseconds.
+
+    Raises:
+        ParameterFileError: not a number of seconds above 0, or no whole number of nanoseconds.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise ParameterFileError(f"sample_period is {value!r}: it must be a number of seconds above 0")
+    period_ns = round(value * 1e9)
+    if period_ns < 1 or abs(period_ns - value * 1e9) > 1e-3:
+        raise ParameterFileError(f"sample_period is {value!r} s: it must be a whole number of nanoseconds")
+    return period_ns
+
+
+def load_case(name: str | Path) -> Case:
+    """A case by its name (`p1-c0.5`) or by the path of its parameter file.
+
+    Raises:
+        ParameterFileError, PlantError, PlanError, GainsError: the file is missing or something in it is wrong.
+    """
+    path = find_parameter_file(name)
+    plant, controller, scenario, tuner = (
+        read_parameters(path, n) for n in ("plant", "controller", "scenario", "tuner")
+    )
+    try:
+        case = Case(
+            name=path.stem,
+            sample_period_ns=sample_period_in_ns(plant.get("sample_period", DEFAULT_SAMPLE_PERIOD)),
+            model=str(plant.get("model", "first_order")),
+            plant_values=plant,
+            effort_limits=(float(plant.get("effort_min", -math.inf)), float(plant.get("effort_max", math.inf))),
+            gains=gains_from_mapping(controller),
+            episodes=read_episodes(scenario),
+            bounds=_bounds(tuner),
+            weight=float(tuner.get("weight", 1.0)),
+        )
+        _ = case.plant, case.plans
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"{path}: {error}") from error
+    return case
+
+
+def find_parameter_file(name: str | Path) -> Path:
+    """Where the parameter file of a case lies: the path itself, or `config/<name>.yaml` of the package.
+
+    Raises:
+        ParameterFileError: there is none.
+    """
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path
+    folder = config_folder()
+    found = folder / f"{name}.yaml"
+    if not found.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none"
+        raise ParameterFileError(f"no case {str(name)!r}: the cases are {known}, or give the path of a parameter file")
+    return found
+
+
+def config_folder() -> Path:
+    """The folder of the package's parameter files: beside the package in a checkout, else under `share/`."""
+    package = Path(__file__).parent
+    candidates = [package.parent / "config"]
+    candidates += [parent / "share" / "tdof_npid_ros" / "config" for parent in (*package.parents, Path(sys.prefix))]
+    return next((folder for folder in candidates if folder.is_dir()), candidates[0])
+
+
+def read_episodes(scenario: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """The lines of each episode from the scenario's parameters `episodes` and `plan.<episode>`.
+
+    Raises:
+        PlanError: an episode has no plan.
+    """
+    episodes = {}
+    for name in scenario.get("episodes", []):
+        lines = scenario.get(f"plan.{name}")
+        if not isinstance(lines, (list, tuple)) or not lines:
+            raise PlanError(f"episode {name!r} has no plan: give its lines as the list of strings plan.{name}")
+        episodes[str(name)] = tuple(str(line) for line in lines)
+    return episodes
+
+
+def _bounds(tuner: Mapping[str, Any]) -> dict[str, Bounds]:
+    bounds = {}
+    for name in PER_LANE:
+        if f"bounds.{name}" in tuner:
+            bounds[name] = read_bounds(name, tuner[f"bounds.{name}"])
+    return bounds
+
+
+def read_bounds(name: str, value: Any) -> Bounds:
+    """Lower and upper bound of a gain.
+
+    Raises:
+        ParameterFileError: not two finite numbers in order.
+    """
+    good = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(v, (int, float)) for v in value)
+    if not good or not -math.inf < value[0] < value[1] < math.inf:
+        raise ParameterFileError(
+            f"bounds.{name} is {value!r}: it must be [lower, upper] with lower < upper, both finite"
+        )
+    return float(value[0]), float(value[1])
+
+
+def controller_type(value: str) -> ControllerType:
+    """A controller type by name.
+
+    Raises:
+        ParameterFileError: there is no such type.
+    """
+    for known in CONTROLLER_TYPES:
+        if value == known:
+            return known
+    raise ParameterFileError(f"no controller type {value!r}: the types are {', '.join(CONTROLLER_TYPES)}")
+
+
+__all__ = ["Case", "PlantError", "load_case"]

@@ -1,0 +1,53 @@
+"""The arguments that say which gains a subcommand runs with."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tdof_npid_ros.case import Case, controller_type
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, Gains, gains_from_mapping
+from tdof_npid_ros.paper.tables import published
+from tdof_npid_ros.paper.tuned import tuned
+from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
+
+
+def add_gain_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --controller, --gains and one option per gain."""
+    parser.add_argument("--controller", metavar="TYPE", help=f"{', '.join(CONTROLLER_TYPES)} (default: the case's)")
+    parser.add_argument(
+        "--gains",
+        default=None,
+        metavar="published|tuned|FILE",
+        help="where the gains come from (default: published, or the case's own)",
+    )
+    for name in PER_LANE:
+        parser.add_argument(f"--{name}", type=float, help=f"override {name}")
+
+
+def chosen_gains(case: Case, arguments: argparse.Namespace) -> Gains:
+    """The gains that the arguments ask for; limits and anti-windup stay the case's.
+
+    Raises:
+        ParameterFileError, GainsError: there are no such gains, or they are not valid.
+    """
+    kind = controller_type(arguments.controller) if arguments.controller else case.gains.type
+    overrides = {name: getattr(arguments, name) for name in PER_LANE if getattr(arguments, name) is not None}
+    return gains_by_source(case, kind, arguments.gains).with_values(**overrides)
+
+
+def gains_by_source(case: Case, kind: str, source: str | None) -> Gains:
+    """Gains of a controller type: `published`, `tuned`, from a parameter file, or (None) published or else the case's."""
+    type_ = controller_type(kind)
+    if source not in (None, "published", "tuned"):
+        values = read_parameters(Path(source), "controller")
+        return gains_from_mapping({**case.gains.as_dict(), **values, "type": type_})
+    table = {"published": published, "tuned": tuned}[source or "published"]
+    row = table(case.name, type_)
+    if row is None and source is None:
+        return case.gains.with_values(type=type_)
+    if row is None:
+        raise ParameterFileError(
+            f"there are no {source} gains for {type_} on {case.name}: give --gains FILE, or --kp …"
+        )
+    return case.gains.with_values(type=type_, **{name: getattr(row.gains, name) for name in PER_LANE})

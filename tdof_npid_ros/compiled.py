@@ -1,0 +1,65 @@
+"""How the hot functions are compiled: Numba, IEEE arithmetic, machine code kept on disk.
+
+No fast-math: a sum keeps its order and no multiply-add is fused, so a function gives the same bits wherever it is
+inlined and however many lanes are vectorised. That is what the equalities E1-E4 stand on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+from numba.extending import overload
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).parent
+_SOURCES = (
+    "compiled.py",
+    "loop.py",
+    "control/exponential.py",
+    "control/law.py",
+    "plants/kernels.py",
+    "plants/states.py",
+)
+
+
+def compiled(function: F) -> F:
+    """Compile a function into the compiled functions that call it."""
+    return cast(F, numba.njit(error_model="numpy", nogil=True, forceinline=True)(function))
+
+
+def implementation_of(stub: Callable[..., Any]) -> Callable[[F], F]:
+    """Decorate a function that picks, by the types of the arguments, what a call of `stub` compiles to."""
+    return cast(Callable[[F], F], overload(stub, strict=False))
+
+
+def entry_point(function: F) -> F:
+    """Compile a function that Python calls; its machine code is kept on disk for the next start.
+
+    Numba looks only at the file of the function itself to see whether its cache is stale, but an entry point contains
+    the inlined code of several files. So each state of those files has a cache folder of its own.
+    """
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_cache_root(before) / _sources_digest())
+    try:
+        return cast(F, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def _cache_root(configured: str) -> Path:
+    if configured:
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tdof_npid_ros"
+
+
+def _sources_digest() -> str:
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        digest.update((_PACKAGE / name).read_bytes())
+    return digest.hexdigest()[:16]

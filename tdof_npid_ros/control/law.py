@@ -1,0 +1,131 @@
+"""The paper's control law, sampled: equations (1) to (8) on one screen.
+
+The law is one compiled scalar function, `law`; `answer_lanes` applies it to an array of lanes. The in-process loop,
+the controller node and `verify` all step through it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.control.exponential import exp_minus
+from tdof_npid_ros.control.gains import PER_LANE, Gains
+
+# Rows of the coefficient array (COEFFICIENTS, lanes) that the compiled law reads.
+(KP, KI_H, KD_H, PHI, ALPHA, BETA, HALF_INVERSE_SIGMA2, TRACKING) = range(8)
+COEFFICIENTS = 8
+Limits = tuple[float, float, float, float, float]  # u_min, u_max, u_i's min and max, 1.0 for conditional integration
+
+
+@compiled
+def law(c: Any, limits: Any, r: Any, y: Any, u_i: Any, z: Any) -> Any:
+    """One sample of the TDOF-NPID law. Returns u, u_i and z for the next sample, u before its limits, ζ, u_p, u_d.
+
+    Args: the coefficients of one lane and the limits (see `coefficients`), r setpoint, y output,
+    u_i integral action, z derivative filter's state.
+    """
+    kp, ki_h, kd_h, phi, alpha, beta, q, tracking = c
+    u_min, u_max, i_min, i_max, conditional = limits
+    e = r - y
+    zeta = exp_minus(e * e * q) * e  # (3), (4)
+    u_p = kp * ((1.0 - alpha) * r - y)  # (7)
+    e_d = (1.0 - beta) * r - y
+    u_d = kd_h * (e_d - z)  # (1b), its mean over the coming sample
+    raw = u_p + u_i + u_d
+    u = min(max(raw, u_min), u_max)
+
+    step = ki_h * zeta  # (2), (5b)
+    windup = conditional * (raw - u) * step > 0.0
+    u_i = u_i + (0.0 if windup else step) + tracking * (u - raw)
+    u_i = min(max(u_i, i_min), i_max)
+    z = e_d + phi * (z - e_d)
+    return u, u_i, z, raw, zeta, u_p, u_d
+
+
+@compiled
+def lane_coefficients(c: Any, j: Any, lanes: Any) -> Any:
+    """The coefficients of lane j as a tuple, from the flat coefficient array."""
+    return (c[j], c[lanes + j], c[2 * lanes + j], c[3 * lanes + j],
+            c[4 * lanes + j], c[5 * lanes + j], c[6 * lanes + j], c[7 * lanes + j])  # fmt: skip
+
+
+@entry_point
+def answer_lanes(
+    c: np.ndarray, limits: Limits, r: np.ndarray, y: np.ndarray, state: np.ndarray, u: np.ndarray, terms: np.ndarray
+) -> None:
+    """One sample of every lane.
+
+    Args:
+        c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `coefficients`.
+        r, y: setpoint and output, (lanes,).
+        state: integral action and derivative filter's state, (2, lanes); advanced in place.
+        u: effort, (lanes,); written.
+        terms: error, scaled error, proportional, integral, derivative and unlimited effort, (6, lanes); written.
+    """
+    lanes = y.shape[0]
+    for j in range(lanes):
+        u_i = state[0, j]
+        u[j], state[0, j], state[1, j], raw, zeta, u_p, u_d = law(
+            lane_coefficients(c, j, lanes), limits, r[j], y[j], u_i, state[1, j]
+        )
+        terms[0, j] = r[j] - y[j]
+        terms[1, j] = zeta
+        terms[2, j] = u_p
+        terms[3, j] = u_i
+        terms[4, j] = u_d
+        terms[5, j] = raw
+
+
+TERMS = ("error", "scaled_error", "proportional", "integral", "derivative", "unlimited_effort")
+
+
+@entry_point
+def _exp_minus(q: np.ndarray) -> np.ndarray:
+    out = np.empty_like(q)
+    for j in range(q.shape[0]):
+        out[j] = exp_minus(q[j])
+    return out
+
+
+def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -> tuple[np.ndarray, Limits]:
+    """What the compiled law reads for gains sampled every `sample_period` seconds.
+
+    Returns:
+        The coefficients, (COEFFICIENTS, lanes), and the limits that all lanes share.
+    """
+    lanes = lanes or gains.lanes
+    h = sample_period
+    kp, ki, kd, alpha, beta, sigma = (gains.per_lane(name, lanes) for name in PER_LANE)
+    c = np.zeros((COEFFICIENTS, lanes))
+    c[KP] = kp
+    c[KI_H] = h * ki
+    # T_f = K_d/(K_p N); without derivative action it is 0 and the filter follows at once.
+    rate = np.divide(kp * gains.n, kd, out=np.full(lanes, np.inf), where=kd != 0)
+    c[PHI] = _exp_minus(h * rate)
+    c[KD_H] = kd / h * (1.0 - c[PHI])
+    if gains.type in ("tdof_npid1", "tdof_npid2"):
+        c[ALPHA] = alpha
+    if gains.type == "tdof_npid2":
+        c[BETA] = beta
+    if gains.type != "pid":
+        c[HALF_INVERSE_SIGMA2] = 1.0 / (2.0 * sigma * sigma)
+    if gains.anti_windup == "back_calculation":
+        c[TRACKING] = 1.0 - _exp_minus(h / tracking_time(gains, lanes))
+    conditional = float(gains.anti_windup == "conditional")
+    return c, (gains.effort_min, gains.effort_max, gains.integral_min, gains.integral_max, conditional)
+
+
+def tracking_time(gains: Gains, lanes: int | None = None) -> np.ndarray:
+    """Back-calculation's tracking time in s, (lanes,): as given, or sqrt(kd/ki), or kp/ki without derivative action.
+
+    The automatic choice is that of control_toolbox. Without integral action there is nothing to track: infinite.
+    """
+    kp, ki, kd = (gains.per_lane(name, lanes) for name in ("kp", "ki", "kd"))
+    if gains.tracking_time > 0:
+        return np.full(kp.shape, gains.tracking_time)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        automatic = np.where(kd != 0, np.sqrt(np.abs(kd / ki)), np.abs(kp / ki))
+    return np.where(ki == 0, np.inf, np.where(automatic == 0, np.finfo(float).tiny, automatic))

@@ -1,0 +1,267 @@
+"""The one closed loop: plant and controller under a plan, for any number of lanes, compiled.
+
+The step order is that of the nodes in lockstep: the plant gives y[k], the controller answers with u[k], the plant
+advances to k+1 under u[k] and d[k].
+
+Two compiled drivers run the same step: `_run_lane` keeps one lane's state in registers, `_run_block` steps a block of
+lanes side by side so that the compiler can vectorise over them. Both give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
+from tdof_npid_ros.plants.kernels import plant_advance, plant_input, plant_output
+from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.states import either, loaded, store
+from tdof_npid_ros.scenario import Signals
+
+DIVERGED = 1e100  # |y| beyond it: the lane stays where it was, so that no infinity ever appears
+VECTOR = 8  # lanes: block widths are multiples of it, and at least two of it
+LARGEST_BLOCK = 64  # lanes
+
+# A lane's rows: its coefficients, then these, then the plant's state.
+(_U_I, _Z, _ERROR_SUM, _SOUND_STEPS, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
+
+PlantAt = Callable[[dict[str, float]], Plant]  # the plant for a set of changed parameters
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """An episode of the closed loop.
+
+    Attributes:
+        time: s, (steps + 1,).
+        setpoint, disturbance: (steps + 1,).
+        output: y, (steps + 1, lanes).
+        control_effort: u as the controller gives it, (steps + 1, lanes); the last one moves nothing any more.
+    """
+
+    time: np.ndarray
+    setpoint: np.ndarray
+    disturbance: np.ndarray
+    output: np.ndarray
+    control_effort: np.ndarray
+
+
+@dataclass(frozen=True)
+class Integrals:
+    """What tuning needs of an episode, per lane.
+
+    Attributes:
+        iae: integral of the absolute error (9), trapezoidal rule, (lanes,).
+        sound_share: share of the steps before the lane diverged, (lanes,); 1 for a lane that did not.
+    """
+
+    iae: np.ndarray
+    sound_share: np.ndarray
+
+
+def simulate(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: tuple[float, float]) -> Trajectory:
+    """Run one episode and keep its trajectory.
+
+    Args:
+        plant_at: the plant for a set of changed parameters, for example `case.plant_at`.
+        gains: for one lane or many.
+        signals: the sampled plan.
+        effort_limits: the plant's own, after those of the controller.
+    """
+    output, effort = np.empty((2, signals.steps + 1, gains.lanes))
+    _run(plant_at, gains, signals, effort_limits, output, effort)
+    return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
+
+
+def integrals(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: tuple[float, float]) -> Integrals:
+    """Run one episode and keep only its integrals; arguments as for `simulate`."""
+    nothing = np.empty((0, gains.lanes))
+    return _run(plant_at, gains, signals, effort_limits, nothing, nothing)
+
+
+def _run(
+    plant_at: PlantAt,
+    gains: Gains,
+    signals: Signals,
+    limits: tuple[float, float],
+    output: np.ndarray,
+    effort: np.ndarray,
+) -> Integrals:
+    lanes, steps = gains.lanes, signals.steps
+    c, gain_limits = coefficients(gains, signals.sample_period_ns / 1e9)
+    iae, sound = np.empty((2, lanes))
+    for first in range(0, lanes, LARGEST_BLOCK):
+        block = slice(first, min(first + LARGEST_BLOCK, lanes))
+        width = _width(block.stop - block.start)
+        y, u = np.empty((2, steps + 1 if len(output) else 0, width))
+        lane_rows = _run_block_of(plant_at, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
+        iae[block], sound[block] = lane_rows[_ERROR_SUM : _SOUND_STEPS + 1, : block.stop - block.start]
+        if len(output):
+            output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
+    return Integrals(iae * (signals.sample_period_ns / 1e9), np.minimum(sound, steps) / steps)
+
+
+def _width(lanes: int) -> int:
+    return 1 if lanes == 1 else max(2 * VECTOR, -(-lanes // VECTOR) * VECTOR)
+
+
+def _padded(c: np.ndarray, width: int) -> np.ndarray:
+    return np.ascontiguousarray(c[:, np.minimum(np.arange(width), c.shape[1] - 1)])
+
+
+def _run_block_of(
+    plant_at: PlantAt,
+    c: np.ndarray,
+    gain_limits: Limits,
+    signals: Signals,
+    limits: tuple[float, float],
+    y: np.ndarray,
+    u: np.ndarray,
+) -> np.ndarray:
+    """Run `width` lanes through every segment of the plan; returns the lanes' rows, (_X + states, width)."""
+    width = c.shape[1]
+    initial = plant_at({}).initial_state
+    rows = np.zeros((_X + len(initial), width))
+    rows[:COEFFICIENTS] = c
+    rows[_X:] = np.reshape(initial, (-1, 1))
+    ring: np.ndarray | None = None
+    for segment in signals.segments:
+        sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
+        if ring is None:
+            ring = np.zeros((sampled.delay + 2, width))
+        last = segment.last + (segment.last == signals.steps)  # the last output is answered too
+        arguments = (sampled, initial, signals.setpoint, signals.disturbance, segment.first, last,
+                     gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip
+        if width == 1:
+            _run_lane(*arguments)
+        else:
+            _run_block(*arguments, (0,) * width)
+    return rows
+
+
+@compiled
+def advance_sound(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
+    """The plant's state one step on, and whether the lane is sound; a lane that diverges stays where it was."""
+    moved = plant_advance(plant, x, v_old, v_new, d)
+    sound = abs(plant_output(plant, moved)) < DIVERGED
+    return either(sound, moved, x), sound
+
+
+@compiled
+def closed_step(
+    plant: Any, x: Any, u_i: Any, z: Any, c: Any, gain_limits: Any, limits: Any, r: Any, d: Any, v_old: Any, v_due: Any
+) -> Any:
+    """One step of one lane: y, u and the plant's input v, then the state after it.
+
+    v_old, v_due: the plant's input `delay + 1` and `delay` samples ago (without delay, v itself is due).
+    """
+    y = plant_output(plant, x)
+    u, u_i, z, _, _, _, _ = law(c, gain_limits, r, y, u_i, z)
+    v = plant_input(plant, min(max(u, limits[0]), limits[1]), d)
+    x, sound = advance_sound(plant, x, v_old, v if plant.delay == 0 else v_due, d)
+    return y, u, v, x, u_i, z, sound
+
+
+@entry_point
+def _run_lane(
+    plant: Any,
+    x: Any,
+    setpoint: Any,
+    disturbance: Any,
+    first: Any,
+    last: Any,
+    gain_limits: Any,
+    limits: Any,
+    rows: Any,
+    ring: Any,
+    y_out: Any,
+    u_out: Any,
+) -> Any:
+    """Steps first to last - 1 of one lane; arrays are flat."""
+    end = setpoint.shape[0] - 1
+    size = np.uint64(plant.delay + 2)
+    new = np.uint64(first) % size
+    c = lane_coefficients(rows, 0, 1)
+    x = loaded(x, rows, _X, 1)
+    u_i, z, error_sum, sound_steps = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND_STEPS]
+    for k in range(first, last):
+        r = setpoint[k]
+        oldest = _next_slot(new, size)
+        due = _next_slot(oldest, size)
+        y, u, ring[new], x, u_i, z, sound = closed_step(
+            plant, x, u_i, z, c, gain_limits, limits, r, disturbance[k], ring[oldest], ring[due]
+        )
+        error_sum += (0.5 if k == 0 or k == end else 1.0) * abs(r - y)
+        sound_steps += 1.0 if sound else 0.0
+        if y_out.shape[0]:
+            y_out[k] = y
+            u_out[k] = u
+        new = oldest
+    store(x, rows, _X, 1)
+    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND_STEPS] = u_i, z, error_sum, sound_steps
+
+
+@entry_point
+def _run_block(
+    plant: Any,
+    x: Any,
+    setpoint: Any,
+    disturbance: Any,
+    first: Any,
+    last: Any,
+    gain_limits: Any,
+    limits: Any,
+    rows: Any,
+    ring: Any,
+    y_out: Any,
+    u_out: Any,
+    lanes: Any,
+) -> Any:
+    """Steps first to last - 1 of a block of lanes side by side; arrays are flat, their rows as long as `lanes`.
+
+    For the compiler to vectorise, it must see that lanes do not overlap in memory. So the width is the length of a
+    tuple, which is part of its type, and the loop over the lanes touches one array only.
+    """
+    w = len(lanes)
+    end = setpoint.shape[0] - 1
+    size = np.uint64(plant.delay + 2)
+    new = np.uint64(first) % size
+    for k in range(first, last):
+        r = setpoint[k]
+        d = disturbance[k]
+        weight = 0.5 if k == 0 or k == end else 1.0
+        oldest = _next_slot(new, size)
+        due = _next_slot(oldest, size)
+        for j in range(w):
+            rows[_V_OLD * w + j] = ring[oldest * np.uint64(w) + np.uint64(j)]
+            rows[_V_DUE * w + j] = ring[due * np.uint64(w) + np.uint64(j)]
+        for j in range(w):
+            x = loaded(x, rows, _X * w + j, w)
+            c = lane_coefficients(rows, j, w)
+            y, u, rows[_V * w + j], x, rows[_U_I * w + j], rows[_Z * w + j], sound = closed_step(
+                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, gain_limits, limits, r, d,
+                rows[_V_OLD * w + j], rows[_V_DUE * w + j],
+            )  # fmt: skip
+            store(x, rows, _X * w + j, w)
+            rows[_ERROR_SUM * w + j] += weight * abs(r - y)
+            rows[_SOUND_STEPS * w + j] += 1.0 if sound else 0.0
+            rows[_Y * w + j] = y
+            rows[_U * w + j] = u
+        for j in range(w):
+            ring[new * np.uint64(w) + np.uint64(j)] = rows[_V * w + j]
+        if y_out.shape[0]:
+            for j in range(w):
+                y_out[k * w + j] = rows[_Y * w + j]
+                u_out[k * w + j] = rows[_U * w + j]
+        new = oldest
+
+
+@compiled
+def _next_slot(slot: Any, size: Any) -> Any:
+    following = slot + np.uint64(1)
+    return np.uint64(0) if following == size else following

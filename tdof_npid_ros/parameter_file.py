@@ -1,0 +1,79 @@
+"""ROS parameter files, read as ROS reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+class ParameterFileError(ValueError):
+    """A parameter file that cannot be read or written; the message names the file and what is wrong with it."""
+
+
+def read_parameters(path: Path, node: str) -> dict[str, Any]:
+    """The parameters that a ROS parameter file gives to a node of that name, in any namespace.
+
+    Nested names are joined by dots. Later and more exact entries win, as in ROS: first `/**`, then the node's own.
+
+    Raises:
+        ParameterFileError: no such file, not YAML, or not a ROS parameter file.
+    """
+    document = _load(path)
+    shared: dict[str, Any] = {}
+    own: dict[str, Any] = {}
+    _collect(document, node, path, shared, own)
+    return shared | own
+
+
+def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:
+    """Write a ROS parameter file: parameters by node name, for nodes in any namespace.
+
+    Raises:
+        ParameterFileError: the file cannot be written.
+    """
+    document = {f"/**/{node}": {"ros__parameters": values} for node, values in nodes.items()}
+    try:
+        path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    except OSError as error:
+        raise ParameterFileError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterFileError(f"{path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParameterFileError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(document, dict):
+        raise ParameterFileError(f"{path} is not a ROS parameter file: it needs node names at the top")
+    return document
+
+
+def _collect(tree: dict[str, Any], node: str, path: Path, shared: dict[str, Any], own: dict[str, Any]) -> None:
+    for key, value in tree.items():
+        if not isinstance(value, dict):
+            raise ParameterFileError(f"{path}: {key!r} stands where a node's name and ros__parameters belong")
+        name = str(key).rsplit("/", 1)[-1]
+        if "ros__parameters" in value:
+            parameters = value["ros__parameters"] or {}
+            if not isinstance(parameters, dict):
+                raise ParameterFileError(f"{path}: ros__parameters of {key!r} is not a mapping of names to values")
+            if name in ("**", "*"):
+                shared.update(_flat(parameters))
+            elif name == node:
+                own.update(_flat(parameters))
+        else:
+            _collect(value, node, path, shared, own)
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat

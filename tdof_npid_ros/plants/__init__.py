@@ -1,0 +1,1 @@
+"""Plants: what is controlled, discretised for the closed loop."""

@@ -1,0 +1,81 @@
+"""Models by name: from a plant's parameters to a plant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from tdof_npid_ros.plants.linear import TransferFunction
+from tdof_npid_ros.plants.ode import Ode, Sprott, load_class
+from tdof_npid_ros.plants.plant import Plant, PlantError
+
+# Parameters of each model and their defaults; the equation is the paper's.
+MODELS: dict[str, dict[str, float | list[float]]] = {
+    "first_order": {"gain": 1.0, "time_constant": 5.0, "dead_time": 0.5},  # (11)
+    "second_order": {"gain": 1.0, "time_constant": 2.0, "dead_time": 1.0},  # (12), both time constants
+    "third_order": {"gain": 1.0, "time_constant": 1.0, "zero_time_constant": 1.0, "dead_time": 0.0},  # (13)
+    "transfer_function": {"numerator": [1.0], "denominator": [1.0, 1.0], "dead_time": 0.0},
+    "sprott": {"a": 0.6, "b": 1.2, "c": 2.0, "initial_state": [0.0, 0.0, 0.0]},  # (14)-(16)
+}
+FIXED_WHILE_RUNNING = ("dead_time", "initial_state", "substeps", "numerator", "denominator")
+
+
+def model_parameters(model: str) -> dict[str, float | list[float]]:
+    """The parameters of a model by name, with their defaults.
+
+    Raises:
+        PlantError: no such model.
+    """
+    if ":" in model:
+        description = load_class(model)
+        return {
+            **{name: float(value) for name, value in description.parameters.items()},  # type: ignore[attr-defined]
+            "initial_state": list(map(float, description.initial_state)),  # type: ignore[attr-defined]
+            "substeps": 1.0,
+        }
+    if model not in MODELS:
+        raise PlantError(f"model {model!r} is unknown: take one of {', '.join(MODELS)}, or package.module:Class")
+    return dict(MODELS[model])
+
+
+def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
+    """The plant of a model; parameters that are not given keep their defaults, others in `values` are passed over.
+
+    Raises:
+        PlantError: no such model, or a parameter of the wrong type or range.
+    """
+    p = {name: _typed(name, values.get(name, default), default) for name, default in model_parameters(model).items()}
+    if ":" in model:
+        initial_state, substeps = p.pop("initial_state"), p.pop("substeps")
+        return Ode(load_class(model), p, tuple(initial_state), int(substeps))
+    if model == "sprott":
+        return Sprott(p["a"], p["b"], p["c"], tuple(p["initial_state"]))
+    if model == "transfer_function":
+        return TransferFunction(tuple(p["numerator"]), tuple(p["denominator"]), p["dead_time"])
+    t = _positive("time_constant", p["time_constant"])
+    if model == "first_order":
+        return TransferFunction((p["gain"],), (t, 1.0), p["dead_time"])
+    if model == "second_order":
+        return TransferFunction((p["gain"],), (t * t, 2.0 * t, 1.0), p["dead_time"])
+    k, c = p["gain"], p["zero_time_constant"]
+    return TransferFunction((-k * c, k), (t**3, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"])
+
+
+def _typed(name: str, value: Any, default: float | list[float]) -> Any:
+    numbers = (
+        list(value)
+        if isinstance(default, list) and not isinstance(value, (str, bytes)) and hasattr(value, "__len__")
+        else [value]
+    )
+    for number in numbers:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
+            wanted = "a list of finite numbers" if isinstance(default, list) else "a finite number"
+            raise PlantError(f"{name} is {value!r}: it must be {wanted}")
+    return [float(number) for number in numbers] if isinstance(default, list) else float(value)
+
+
+def _positive(name: str, value: float) -> float:
+    if value <= 0:
+        raise PlantError(f"{name} is {value}: it must be above 0")
+    return value

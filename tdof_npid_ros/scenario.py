@@ -1,0 +1,284 @@
+"""Scenarios: what the setpoint, the disturbance and the plant's parameters do during an episode.
+
+A plan is written as lines, each `TIME SIGNAL WHAT`, and ends with `TIME end` (times in s):
+
+    0    setpoint 1                      step to 1
+    10   setpoint ramp 2 over 5          from where it is to 2 within 5 s
+    20   disturbance sine 0.5 period 4 for 12
+    40   plant.a 0.72                    a parameter of the plant
+    60   end
+
+What is not named starts at 0 (a plant parameter: at its configured value) and holds until its next line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+SIGNALS = ("setpoint", "disturbance")
+LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
+GRAMMAR = (
+    "TIME setpoint|disturbance|plant.NAME VALUE, TIME SIGNAL ramp VALUE over SECONDS, "
+    "TIME SIGNAL sine AMPLITUDE period SECONDS for SECONDS, or TIME end"
+)
+
+
+class PlanError(ValueError):
+    """A plan that cannot be run; the message quotes the line that is wrong."""
+
+
+class Segment(NamedTuple):
+    """Steps `first` to `last` (excluded) during which the plant's parameters are `plant`."""
+
+    first: int
+    last: int
+    plant: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """A plan sampled: setpoint and disturbance of shape (steps + 1,), and the stretches of constant plant parameters."""
+
+    sample_period_ns: int
+    setpoint: np.ndarray
+    disturbance: np.ndarray
+    segments: tuple[Segment, ...]
+
+    @property
+    def steps(self) -> int:
+        """Number of steps: the last sample's index."""
+        return len(self.setpoint) - 1
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time of each sample in s, (steps + 1,)."""
+        return np.arange(self.steps + 1) * (self.sample_period_ns / 1e9)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Points in time, each holding until the next; the last one's time ends the episode.
+
+    Args:
+        names: `setpoint`, `disturbance`, `plant.<parameter>`, one per column.
+        times_ns: strictly increasing, the first 0.
+        values: (points, names), as nested tuples.
+
+    Raises:
+        PlanError: times out of order, unknown or repeated names, values that are not finite.
+    """
+
+    names: tuple[str, ...]
+    times_ns: tuple[int, ...]
+    values: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if name not in SIGNALS and not (name.startswith("plant.") and len(name) > len("plant.")):
+                raise PlanError(f"unknown signal {name!r}: a plan drives setpoint, disturbance and plant.<parameter>")
+        if len(set(self.names)) != len(self.names):
+            raise PlanError(f"a signal is named twice in {', '.join(self.names)}")
+        if len(self.times_ns) < 2 or len(self.times_ns) != len(self.values):
+            raise PlanError("a plan needs at least two points, its start and its end, with values for each")
+        if self.times_ns[0] != 0:
+            raise PlanError(f"the plan starts at {self.times_ns[0] / 1e9:g} s: its first point must be at 0 s")
+        for i, (time, row) in enumerate(zip(self.times_ns, self.values, strict=True)):
+            if i and time <= self.times_ns[i - 1]:
+                raise PlanError(f"point {i} at {time / 1e9:g} s is not after {self.times_ns[i - 1] / 1e9:g} s")
+            if len(row) != len(self.names):
+                raise PlanError(f"point {i} has {len(row)} values for {len(self.names)} signals")
+            if not all(map(math.isfinite, row)):
+                raise PlanError(f"point {i} at {time / 1e9:g} s holds a value that is not finite: {list(row)}")
+
+    @property
+    def end_ns(self) -> int:
+        """The episode's length."""
+        return self.times_ns[-1]
+
+    @cached_property
+    def digest(self) -> str:
+        """The plan's name: 12 hexadecimal digits made from its content alone."""
+        content = hashlib.sha256(",".join(self.names).encode())
+        content.update(np.asarray(self.times_ns, dtype="<i8").tobytes())
+        content.update(np.asarray(self.values, dtype="<f8").tobytes())
+        return content.hexdigest()[:12]
+
+    def point_at(self, stamp_ns: int) -> int:
+        """Index of the point that holds at `stamp_ns`."""
+        return int(np.searchsorted(self.times_ns, stamp_ns, side="right")) - 1
+
+    def steps(self, sample_period_ns: int) -> int:
+        """Number of steps of an episode: samples are at 0, h, …, steps·h.
+
+        Raises:
+            PlanError: the plan is shorter than a step or absurdly long.
+        """
+        steps = self.end_ns // sample_period_ns
+        if not 1 <= steps <= LARGEST_PLAN:
+            raise PlanError(
+                f"the plan of {self.end_ns / 1e9:g} s has {steps} samples of {sample_period_ns / 1e9:g} s: "
+                f"it needs 1 to {LARGEST_PLAN}"
+            )
+        return steps
+
+    def sampled(self, sample_period_ns: int) -> Signals:
+        """The plan at the stamps k·sample_period_ns."""
+        steps = self.steps(sample_period_ns)
+        stamps = np.arange(steps + 1, dtype=np.int64) * sample_period_ns
+        points = np.searchsorted(np.asarray(self.times_ns), stamps, side="right") - 1
+        values = np.asarray(self.values, dtype=np.float64).reshape(len(self.times_ns), len(self.names))
+        column = {name: values[points, i] for i, name in enumerate(self.names)}
+        zero = np.zeros(steps + 1)
+        return Signals(
+            sample_period_ns,
+            column.get("setpoint", zero),
+            column.get("disturbance", zero),
+            self._segments(column, steps),
+        )
+
+    def _segments(self, column: Mapping[str, np.ndarray], steps: int) -> tuple[Segment, ...]:
+        parameters = [name for name in self.names if name.startswith("plant.")]
+        if not parameters:
+            return (Segment(0, steps, {}),)
+        table = np.stack([column[name][:steps] for name in parameters])
+        starts = [0, *(np.flatnonzero(np.any(np.diff(table, axis=1) != 0, axis=0)) + 1).tolist(), steps]
+        return tuple(
+            Segment(a, b, {name.removeprefix("plant."): float(column[name][a]) for name in parameters})
+            for a, b in zip(starts, starts[1:], strict=False)
+        )
+
+
+def parse_plan(
+    lines: Sequence[str], sample_period_ns: int, plant_parameters: Mapping[str, float] | None = None
+) -> Plan:
+    """A plan from its lines (see this module's docstring); ramps and sines become one point per sample.
+
+    Args:
+        plant_parameters: the plant's parameters that may change while it runs, with their configured values.
+
+    Raises:
+        PlanError: with the line that is wrong.
+    """
+    known = plant_parameters or {}
+    entries = [_parse_line(i, str(line), known) for i, line in enumerate(lines)]
+    if not entries or entries[-1].signal != "end":
+        raise PlanError("a plan ends with the line 'TIME end'")
+    for i, entry in enumerate(entries):
+        if i and entry.time_ns < entries[i - 1].time_ns:
+            raise PlanError(f"line {i + 1} {entry.text!r}: its time is before the line above")
+        if entry.signal == "end" and i + 1 < len(entries):
+            raise PlanError(f"line {i + 2} {entries[i + 1].text!r} comes after the end")
+    names = [
+        name for name in (*SIGNALS, *(f"plant.{name}" for name in known)) if any(e.signal == name for e in entries)
+    ]
+    names = names or ["setpoint"]
+    return _unroll(entries, names, known, sample_period_ns)
+
+
+class _Entry(NamedTuple):
+    text: str
+    time_ns: int
+    signal: str
+    shape: str
+    numbers: tuple[float, ...]
+
+    @property
+    def until_ns(self) -> int:
+        return self.time_ns + (round(self.numbers[-1] * 1e9) if self.shape != "step" else 0)
+
+
+_SHAPES = {"ramp": ("ramp", 0, "over", 0), "sine": ("sine", 0, "period", 0, "for", 0)}  # 0 stands for a number
+
+
+def _parse_line(index: int, text: str, known: Mapping[str, float]) -> _Entry:
+    where = f"line {index + 1} {text!r}"
+    words = text.split()
+    if len(words) < 2:
+        raise PlanError(f"{where}: expected {GRAMMAR}")
+    time = _finite(words[0], where)
+    if time < 0:
+        raise PlanError(f"{where}: its time is negative")
+    signal = words[1]
+    if signal == "end" and len(words) == 2:
+        return _Entry(text, round(time * 1e9), "end", "step", ())
+    if signal.startswith("plant.") and signal.removeprefix("plant.") not in known:
+        raise PlanError(f"{where}: unknown plant parameter; those that may change are {', '.join(known) or 'none'}")
+    if signal not in SIGNALS and not signal.startswith("plant."):
+        raise PlanError(f"{where}: unknown signal {signal!r}; expected {GRAMMAR}")
+    shape, words = (words[2] if len(words) > 2 else ""), words[2:]
+    if shape not in _SHAPES:
+        if len(words) != 1:
+            raise PlanError(f"{where}: expected {GRAMMAR}")
+        return _Entry(text, round(time * 1e9), signal, "step", (_finite(words[0], where),))
+    pattern = _SHAPES[shape]
+    if len(words) != len(pattern) or any(want not in (0, word) for want, word in zip(pattern, words, strict=True)):
+        raise PlanError(f"{where}: expected {GRAMMAR}")
+    numbers = tuple(_finite(word, where) for want, word in zip(pattern, words, strict=True) if want == 0)
+    if any(number <= 0 for number in numbers[1:]):
+        raise PlanError(f"{where}: durations and periods must be above 0")
+    return _Entry(text, round(time * 1e9), signal, shape, numbers)
+
+
+def _finite(word: str, where: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        raise PlanError(f"{where}: {word!r} is not a number; expected {GRAMMAR}") from None
+    if not math.isfinite(value):
+        raise PlanError(f"{where}: {word} is not finite")
+    return value
+
+
+def _unroll(entries: list[_Entry], names: list[str], known: Mapping[str, float], period_ns: int) -> Plan:
+    end_ns = entries[-1].time_ns
+    if not 1 <= end_ns // period_ns <= LARGEST_PLAN:
+        raise PlanError(
+            f"line {len(entries)} {entries[-1].text!r}: an episode has 1 to {LARGEST_PLAN} samples of {period_ns / 1e9:g} s"
+        )
+    tracks = {name: {0: float(known.get(name.removeprefix("plant."), 0.0))} for name in names}
+    for i, entry in enumerate(entries[:-1]):
+        following = [e.time_ns for e in entries[i + 1 :] if e.signal in (entry.signal, "end")]
+        tracks[entry.signal].update(
+            _points(entry, _value_at(tracks[entry.signal], entry.time_ns), following[0], period_ns)
+        )
+    times = sorted({0, end_ns, *(t for track in tracks.values() for t in track if t < end_ns)})
+    columns = [_held(tracks[name], times) for name in names]
+    return Plan(tuple(names), tuple(times), tuple(zip(*columns, strict=True)))
+
+
+def _points(entry: _Entry, start: float, stop_ns: int, period_ns: int) -> dict[int, float]:
+    """The points that an entry adds to its signal: one, or one per sample while a ramp or sine lasts."""
+    if entry.shape == "step":
+        return {entry.time_ns: entry.numbers[0]}
+    duration = entry.until_ns - entry.time_ns
+    first = -(-entry.time_ns // period_ns) * period_ns
+    points = {}
+    for t in range(first, min(entry.until_ns, stop_ns), period_ns):
+        passed = (t - entry.time_ns) / duration
+        if entry.shape == "ramp":
+            points[t] = start + (entry.numbers[0] - start) * passed
+        else:
+            amplitude, sine_period, seconds = entry.numbers
+            points[t] = start + amplitude * math.sin(2 * math.pi * passed * seconds / sine_period)
+    if entry.until_ns < stop_ns:
+        points[entry.until_ns] = entry.numbers[0] if entry.shape == "ramp" else start
+    return points
+
+
+def _value_at(track: Mapping[int, float], time_ns: int) -> float:
+    return track[max(t for t in track if t <= time_ns)]
+
+
+def _held(track: Mapping[int, float], times: Sequence[int]) -> list[float]:
+    values, current = [], 0.0
+    for t in times:
+        current = track.get(t, current)
+        values.append(current)
+    return values

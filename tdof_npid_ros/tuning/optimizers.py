@@ -1,0 +1,198 @@
+"""The HGA and, to check it against, two well-kept libraries' optimisers, all in ask/tell form.
+
+`Cmaes` is the `cma` library's CMA-ES with restarts of doubled population (IPOP), `DifferentialEvolution` is SciPy's.
+Neither library can write its state but by pickle, which must not be read from a file that others could have made. So
+their state is the values told: a restored run asks and is told them again. That is exact on one machine; across
+machines it is not, for both use the machine's BLAS or math library. The HGA's state is exact everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
+from tdof_npid_ros.tuning.hga import HGA
+
+INITIAL_STEP = 0.3
+"""CMA-ES's first standard deviation, as a share of the bounds' distance: what the library advises."""
+
+
+def make_optimizer(
+    algorithm: str,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    seed: int,
+    population: int = 40,
+    generations: int = 200,
+) -> Optimizer:
+    """An optimiser that ends after population * generations evaluations.
+
+    Args:
+        algorithm: one of `ALGORITHMS`. `cmaes` takes the library's own population; for it only the budget counts.
+        lower, upper: [d], bounds of the parameters.
+        seed: not negative.
+
+    Raises:
+        TuningError: unknown algorithm, or an argument out of its range.
+    """
+    return _kind(algorithm)(lower, upper, seed=seed, population=population, generations=generations)
+
+
+def restore_optimizer(state: dict[str, Any]) -> Optimizer:
+    """The run that `Optimizer.state` was taken of; it goes on as if it had never stopped.
+
+    Raises:
+        TuningError: not a state, of an unknown algorithm, or damaged.
+    """
+    if not isinstance(state, dict) or "algorithm" not in state:
+        raise TuningError("state of the optimiser is damaged, start anew: no algorithm in it")
+    return _kind(state["algorithm"]).from_state(state)
+
+
+class _Replayed(Optimizer):
+    """A library's optimiser, whose state is the values that it was told."""
+
+    algorithm: str
+
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
+        least = {"seed": (seed, 0), "population": (population, 5), "generations": (generations, 1)}
+        for name, (count, minimum) in least.items():
+            if isinstance(count, bool) or not isinstance(count, int) or count < minimum:
+                raise TuningError(f"{name} {count!r}: must be a whole number, at least {minimum}")
+        super().__init__(lower, upper, population * generations)
+        self.seed, self.population, self.generations = seed, population, generations
+        self._told: list[list[float]] = []
+
+    def _next(self, told: Array) -> Array:
+        raise NotImplementedError
+
+    def tell(self, values: ArrayLike) -> None:
+        super().tell(values)
+        self._told.append(np.asarray(values, dtype=np.float64).tolist())
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "algorithm": self.algorithm,
+            "lower": self.lower.tolist(),
+            "upper": self.upper.tolist(),
+            "seed": self.seed,
+            "population": self.population,
+            "generations": self.generations,
+            "told": [list(values) for values in self._told],
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> _Replayed:
+        """The run that `state` was taken of. Raises TuningError where the state is damaged."""
+        try:
+            arguments = {name: state[name] for name in ("seed", "population", "generations")}
+            optimizer = cls(state["lower"], state["upper"], **arguments)
+            for values in state["told"]:
+                optimizer.tell(values)
+        except (KeyError, TypeError, ValueError) as error:
+            raise TuningError(f"state of {cls.algorithm} is damaged, start anew: {error!r}") from None
+        return optimizer
+
+
+class Cmaes(_Replayed):
+    """CMA-ES of the `cma` library; each restart begins at a random point with twice the population."""
+
+    algorithm = "cmaes"
+
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
+        super().__init__(lower, upper, seed=seed, population=population, generations=generations)
+        self._random = np.random.default_rng(seed)
+        self._restarts = -1
+        self._unit = self._restarted()
+
+    def _restarted(self) -> Array:
+        import cma
+
+        self._restarts += 1
+        options = {
+            "bounds": [0.0, 1.0],
+            "popsize": (4 + int(3.0 * math.log(self.dimension))) * 2**self._restarts,
+            "randn": lambda *shape: self._random.standard_normal(shape),
+            "seed": math.nan,  # the library must leave NumPy's global generator alone
+            "verbose": -9,
+        }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._strategy = cma.CMAEvolutionStrategy(self._random.random(self.dimension), INITIAL_STEP, options)
+        return self._asked()
+
+    def _asked(self) -> Array:
+        self._points = self._strategy.ask()
+        return np.clip(np.array(self._points, dtype=np.float64), 0.0, 1.0)
+
+    def _next(self, told: Array) -> Array:
+        self._strategy.tell(self._points, told.tolist())
+        return self._restarted() if self._strategy.stop() else self._asked()
+
+
+class DifferentialEvolution(_Replayed):
+    """SciPy's `differential_evolution`, a generation at a time, without its polish.
+
+    SciPy calls its objective, so it runs in a thread of its own, which waits in that call for the values told.
+    """
+
+    algorithm = "de"
+
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
+        super().__init__(lower, upper, seed=seed, population=population, generations=generations)
+        self._asked: queue.SimpleQueue[Array | None] = queue.SimpleQueue()
+        self._values: queue.SimpleQueue[Array] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name="differential_evolution", daemon=True).start()
+        self._unit = self._candidates()
+
+    def _run(self) -> None:
+        from scipy.optimize import differential_evolution
+
+        random = np.random.default_rng(self.seed)
+        differential_evolution(
+            self._evaluate,
+            [(0.0, 1.0)] * self.dimension,
+            init=random.random((self.population, self.dimension)),
+            maxiter=self.generations,
+            tol=0.0,
+            rng=random,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+        )
+        self._asked.put(None)
+
+    def _evaluate(self, points: Array) -> Array:
+        """Candidates [d, n] to their values [n]: SciPy's side."""
+        self._asked.put(np.ascontiguousarray(points.T))
+        return self._values.get()
+
+    def _candidates(self) -> Array:
+        candidates = self._asked.get()
+        return np.empty((0, self.dimension)) if candidates is None else candidates
+
+    def _next(self, told: Array) -> Array:
+        self._values.put(told)
+        return self._candidates()
+
+
+ALGORITHMS: dict[str, type[HGA] | type[Cmaes] | type[DifferentialEvolution]] = {
+    "hga": HGA,
+    "cmaes": Cmaes,
+    "de": DifferentialEvolution,
+}
+
+
+def _kind(algorithm: object) -> type[HGA] | type[Cmaes] | type[DifferentialEvolution]:
+    if not isinstance(algorithm, str) or algorithm not in ALGORITHMS:
+        raise TuningError(f"algorithm {algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[algorithm]
