@@ -24,6 +24,7 @@ _SOURCES = (
     "control/exponential.py",
     "control/law.py",
     "plants/kernels.py",
+    "plants/lanes.py",
     "plants/states.py",
 )
 

@@ -18,12 +18,12 @@ import numpy as np
 from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
-from tdof_npid_ros.plants.kernels import plant_advance, plant_input, plant_output
+from tdof_npid_ros.plants.kernels import plant_input, plant_output
+from tdof_npid_ros.plants.lanes import advance_sound, applied
 from tdof_npid_ros.plants.plant import Plant
-from tdof_npid_ros.plants.states import either, loaded, store
+from tdof_npid_ros.plants.states import loaded, store
 from tdof_npid_ros.scenario import Signals
 
-DIVERGED = 1e100  # |y| beyond it: the lane stays where it was, so that no infinity ever appears
 VECTOR = 8  # lanes: block widths are multiples of it, and at least two of it
 LARGEST_BLOCK = 64  # lanes
 
@@ -145,14 +145,6 @@ def _run_block_of(
 
 
 @compiled
-def advance_sound(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
-    """The plant's state one step on, and whether the lane is sound; a lane that diverges stays where it was."""
-    moved = plant_advance(plant, x, v_old, v_new, d)
-    sound = abs(plant_output(plant, moved)) < DIVERGED
-    return either(sound, moved, x), sound
-
-
-@compiled
 def closed_step(
     plant: Any, x: Any, u_i: Any, z: Any, c: Any, gain_limits: Any, limits: Any, r: Any, d: Any, v_old: Any, v_due: Any
 ) -> Any:
@@ -162,7 +154,7 @@ def closed_step(
     """
     y = plant_output(plant, x)
     u, u_i, z, _, _, _, _ = law(c, gain_limits, r, y, u_i, z)
-    v = plant_input(plant, min(max(u, limits[0]), limits[1]), d)
+    v = plant_input(plant, applied(u, limits), d)
     x, sound = advance_sound(plant, x, v_old, v if plant.delay == 0 else v_due, d)
     return y, u, v, x, u_i, z, sound
 

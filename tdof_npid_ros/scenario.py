@@ -5,17 +5,20 @@ A plan is written as lines, each `TIME SIGNAL WHAT`, and ends with `TIME end` (t
     0    setpoint 1                      step to 1
     10   setpoint ramp 2 over 5          from where it is to 2 within 5 s
     20   disturbance sine 0.5 period 4 for 12
-    40   plant.a 0.72                    a parameter of the plant
+    0    plant.a 0.6                     a parameter of the plant
+    40   plant.a 0.72
     60   end
 
-What is not named starts at 0 (a plant parameter: at its configured value) and holds until its next line.
+A value holds until its signal's next line. Setpoint and disturbance start at 0; a plant's parameter that changes
+needs a line at 0 too, so that a plan says by itself what it does.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -110,9 +113,12 @@ class Plan:
         content.update(np.asarray(self.values, dtype="<f8").tobytes())
         return content.hexdigest()[:12]
 
-    def point_at(self, stamp_ns: int) -> int:
-        """Index of the point that holds at `stamp_ns`."""
-        return int(np.searchsorted(self.times_ns, stamp_ns, side="right")) - 1
+    def value_at(self, name: str, stamp_ns: int) -> float:
+        """The value of a signal at `stamp_ns`, 0 for a signal that the plan does not name."""
+        if name not in self.names:
+            return 0.0
+        point = bisect_right(self.times_ns, stamp_ns) - 1
+        return self.values[max(point, 0)][self.names.index(name)]
 
     def steps(self, sample_period_ns: int) -> int:
         """Number of steps of an episode: samples are at 0, h, …, steps·h.
@@ -155,35 +161,29 @@ class Plan:
         )
 
 
-def parse_plan(
-    lines: Sequence[str], sample_period_ns: int, plant_parameters: Mapping[str, float] | None = None
-) -> Plan:
+def parse_plan(lines: Sequence[str], sample_period_ns: int, plant_parameters: Collection[str] | None = None) -> Plan:
     """A plan from its lines (see this module's docstring); ramps and sines become one point per sample.
 
     Args:
-        plant_parameters: the plant's parameters that may change while it runs, with their configured values.
+        plant_parameters: names of the plant's parameters that may change while it runs; None: not known here.
 
     Raises:
         PlanError: with the line that is wrong.
     """
-    known = plant_parameters or {}
-    entries = [_parse_line(i, str(line), known) for i, line in enumerate(lines)]
+    entries = [_parse_line(i, str(line), plant_parameters) for i, line in enumerate(lines)]
     if not entries or entries[-1].signal != "end":
         raise PlanError("a plan ends with the line 'TIME end'")
     for i, entry in enumerate(entries):
         if i and entry.time_ns < entries[i - 1].time_ns:
-            raise PlanError(f"line {i + 1} {entry.text!r}: its time is before the line above")
+            raise PlanError(f"{entry.where}: its time is before the line above")
         if entry.signal == "end" and i + 1 < len(entries):
-            raise PlanError(f"line {i + 2} {entries[i + 1].text!r} comes after the end")
-    names = [
-        name for name in (*SIGNALS, *(f"plant.{name}" for name in known)) if any(e.signal == name for e in entries)
-    ]
-    names = names or ["setpoint"]
-    return _unroll(entries, names, known, sample_period_ns)
+            raise PlanError(f"{entries[i + 1].where}: it comes after the end")
+    names = list(dict.fromkeys(entry.signal for entry in entries[:-1])) or ["setpoint"]
+    return _unroll(entries, names, sample_period_ns)
 
 
 class _Entry(NamedTuple):
-    text: str
+    where: str
     time_ns: int
     signal: str
     shape: str
@@ -197,7 +197,7 @@ class _Entry(NamedTuple):
 _SHAPES = {"ramp": ("ramp", 0, "over", 0), "sine": ("sine", 0, "period", 0, "for", 0)}  # 0 stands for a number
 
 
-def _parse_line(index: int, text: str, known: Mapping[str, float]) -> _Entry:
+def _parse_line(index: int, text: str, known: Collection[str] | None) -> _Entry:
     where = f"line {index + 1} {text!r}"
     words = text.split()
     if len(words) < 2:
@@ -207,8 +207,8 @@ def _parse_line(index: int, text: str, known: Mapping[str, float]) -> _Entry:
         raise PlanError(f"{where}: its time is negative")
     signal = words[1]
     if signal == "end" and len(words) == 2:
-        return _Entry(text, round(time * 1e9), "end", "step", ())
-    if signal.startswith("plant.") and signal.removeprefix("plant.") not in known:
+        return _Entry(where, round(time * 1e9), "end", "step", ())
+    if known is not None and signal.startswith("plant.") and signal.removeprefix("plant.") not in known:
         raise PlanError(f"{where}: unknown plant parameter; those that may change are {', '.join(known) or 'none'}")
     if signal not in SIGNALS and not signal.startswith("plant."):
         raise PlanError(f"{where}: unknown signal {signal!r}; expected {GRAMMAR}")
@@ -216,14 +216,14 @@ def _parse_line(index: int, text: str, known: Mapping[str, float]) -> _Entry:
     if shape not in _SHAPES:
         if len(words) != 1:
             raise PlanError(f"{where}: expected {GRAMMAR}")
-        return _Entry(text, round(time * 1e9), signal, "step", (_finite(words[0], where),))
+        return _Entry(where, round(time * 1e9), signal, "step", (_finite(words[0], where),))
     pattern = _SHAPES[shape]
     if len(words) != len(pattern) or any(want not in (0, word) for want, word in zip(pattern, words, strict=True)):
         raise PlanError(f"{where}: expected {GRAMMAR}")
     numbers = tuple(_finite(word, where) for want, word in zip(pattern, words, strict=True) if want == 0)
     if any(number <= 0 for number in numbers[1:]):
         raise PlanError(f"{where}: durations and periods must be above 0")
-    return _Entry(text, round(time * 1e9), signal, shape, numbers)
+    return _Entry(where, round(time * 1e9), signal, shape, numbers)
 
 
 def _finite(word: str, where: str) -> float:
@@ -236,17 +236,17 @@ def _finite(word: str, where: str) -> float:
     return value
 
 
-def _unroll(entries: list[_Entry], names: list[str], known: Mapping[str, float], period_ns: int) -> Plan:
+def _unroll(entries: list[_Entry], names: list[str], period_ns: int) -> Plan:
     end_ns = entries[-1].time_ns
     if not 1 <= end_ns // period_ns <= LARGEST_PLAN:
-        raise PlanError(
-            f"line {len(entries)} {entries[-1].text!r}: an episode has 1 to {LARGEST_PLAN} samples of {period_ns / 1e9:g} s"
-        )
-    tracks = {name: {0: float(known.get(name.removeprefix("plant."), 0.0))} for name in names}
+        raise PlanError(f"{entries[-1].where}: an episode has 1 to {LARGEST_PLAN} samples of {period_ns / 1e9:g} s")
+    tracks: dict[str, dict[int, float]] = {name: {0: 0.0} if name in SIGNALS else {} for name in names}
     for i, entry in enumerate(entries[:-1]):
+        if not tracks[entry.signal] and (entry.time_ns, entry.shape) != (0, "step"):
+            raise PlanError(f"{entry.where}: give {entry.signal} a value at 0 s first")
         following = [e.time_ns for e in entries[i + 1 :] if e.signal in (entry.signal, "end")]
         tracks[entry.signal].update(
-            _points(entry, _value_at(tracks[entry.signal], entry.time_ns), following[0], period_ns)
+            _points(entry, _value_at(tracks[entry.signal] or {0: 0.0}, entry.time_ns), following[0], period_ns)
         )
     times = sorted({0, end_ns, *(t for track in tracks.values() for t in track if t < end_ns)})
     columns = [_held(tracks[name], times) for name in names]

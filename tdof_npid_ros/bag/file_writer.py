@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 import numpy as np
 import zstandard
 
@@ -178,7 +178,7 @@ class FileWriter:
 
     def check_in_place(self) -> None:
         """Raise FileNotFoundError when the file is no longer where it was created."""
-        there = os.stat(self.path)
+        there = self.path.stat()
         here = os.fstat(self._descriptor)
         if (there.st_dev, there.st_ino) != (here.st_dev, here.st_ino):
             raise FileNotFoundError(2, "another file is in its place", str(self.path))

@@ -170,7 +170,7 @@ class BagReader:
             Its name.
         fields
             Flattened paths such as "position" or "header.frame_id", by default all. A stamp can be read
-            whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", "header.stamp.nanosec").
+            whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", ".nanosec").
 
         Returns
         -------

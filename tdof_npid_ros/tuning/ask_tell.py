@@ -46,6 +46,7 @@ class Optimizer(ABC):
 
     @property
     def dimension(self) -> int:
+        """How many parameters: d."""
         return int(self.lower.size)
 
     @property
@@ -92,7 +93,7 @@ class Optimizer(ABC):
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """All that the run is, as JSON can hold it exactly; `restore` goes on from it bit for bit."""
+        """All that the run is, as JSON can hold it exactly; `restore_optimizer` goes on from it bit for bit."""
 
     def _in_bounds(self, unit: Array) -> Array:
         return np.clip(self.lower + unit * (self.upper - self.lower), self.lower, self.upper)

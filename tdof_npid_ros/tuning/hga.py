@@ -169,6 +169,7 @@ class HGA(Optimizer):
         return samples
 
     def state(self) -> dict[str, Any]:
+        """All that the run is, as JSON can hold it exactly; `from_state` goes on from it bit for bit."""
         return {
             "algorithm": "hga",
             "lower": self.lower.tolist(),

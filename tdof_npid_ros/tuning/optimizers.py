@@ -12,6 +12,7 @@ import math
 import queue
 import threading
 import warnings
+import weakref
 from typing import Any
 
 import numpy as np
@@ -71,9 +72,6 @@ class _Replayed(Optimizer):
         super().__init__(lower, upper, population * generations)
         self.seed, self.population, self.generations = seed, population, generations
         self._told: list[list[float]] = []
-
-    def _next(self, told: Array) -> Array:
-        raise NotImplementedError
 
     def tell(self, values: ArrayLike) -> None:
         super().tell(values)
@@ -142,7 +140,8 @@ class Cmaes(_Replayed):
 class DifferentialEvolution(_Replayed):
     """SciPy's `differential_evolution`, a generation at a time, without its polish.
 
-    SciPy calls its objective, so it runs in a thread of its own, which waits in that call for the values told.
+    SciPy calls its objective, so it runs in a thread of its own, which waits in that call for the values told. The
+    thread knows the queues alone, so that an optimiser nobody holds any more is collected, which ends the thread.
     """
 
     algorithm = "de"
@@ -150,31 +149,13 @@ class DifferentialEvolution(_Replayed):
     def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
         super().__init__(lower, upper, seed=seed, population=population, generations=generations)
         self._asked: queue.SimpleQueue[Array | None] = queue.SimpleQueue()
-        self._values: queue.SimpleQueue[Array] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name="differential_evolution", daemon=True).start()
+        self._values: queue.SimpleQueue[Array | None] = queue.SimpleQueue()
+        weakref.finalize(self, self._values.put, None)
+        random = np.random.default_rng(seed)
+        initial = random.random((population, self.dimension))
+        arguments = (initial, random, generations, self._asked, self._values)
+        threading.Thread(target=_evolve, args=arguments, name="differential_evolution", daemon=True).start()
         self._unit = self._candidates()
-
-    def _run(self) -> None:
-        from scipy.optimize import differential_evolution
-
-        random = np.random.default_rng(self.seed)
-        differential_evolution(
-            self._evaluate,
-            [(0.0, 1.0)] * self.dimension,
-            init=random.random((self.population, self.dimension)),
-            maxiter=self.generations,
-            tol=0.0,
-            rng=random,
-            polish=False,
-            updating="deferred",
-            vectorized=True,
-        )
-        self._asked.put(None)
-
-    def _evaluate(self, points: Array) -> Array:
-        """Candidates [d, n] to their values [n]: SciPy's side."""
-        self._asked.put(np.ascontiguousarray(points.T))
-        return self._values.get()
 
     def _candidates(self) -> Array:
         candidates = self._asked.get()
@@ -185,14 +166,54 @@ class DifferentialEvolution(_Replayed):
         return self._candidates()
 
 
-ALGORITHMS: dict[str, type[HGA] | type[Cmaes] | type[DifferentialEvolution]] = {
+class _AbandonedError(Exception):
+    """Ends SciPy's thread when its optimiser is gone."""
+
+
+def _evolve(
+    initial: Array,
+    random: np.random.Generator,
+    generations: int,
+    asked: queue.SimpleQueue[Array | None],
+    told: queue.SimpleQueue[Array | None],
+) -> None:
+    """SciPy's side: candidates [n, d] go out, values [n] come in; None is the end of either."""
+    from scipy.optimize import Bounds, differential_evolution
+
+    def evaluate(points: Array) -> Array:
+        asked.put(np.ascontiguousarray(points.T))
+        values = told.get()
+        if values is None:
+            raise _AbandonedError
+        return values
+
+    dimension = initial.shape[1]
+    try:
+        differential_evolution(
+            evaluate,  # type: ignore[arg-type]  # the stubs know no vectorized objective
+            Bounds(np.zeros(dimension), np.ones(dimension)),
+            init=initial,
+            maxiter=generations,
+            tol=0.0,
+            rng=random,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+        )
+    except _AbandonedError:
+        pass
+    finally:
+        asked.put(None)
+
+
+ALGORITHMS: dict[str, type[HGA | Cmaes | DifferentialEvolution]] = {
     "hga": HGA,
     "cmaes": Cmaes,
     "de": DifferentialEvolution,
 }
 
 
-def _kind(algorithm: object) -> type[HGA] | type[Cmaes] | type[DifferentialEvolution]:
+def _kind(algorithm: object) -> type[HGA | Cmaes | DifferentialEvolution]:
     if not isinstance(algorithm, str) or algorithm not in ALGORITHMS:
         raise TuningError(f"algorithm {algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}")
     return ALGORITHMS[algorithm]

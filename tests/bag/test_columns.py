@@ -52,9 +52,9 @@ def test_only_the_fields_asked_for(tmp_path) -> None:
     write_bag(tmp_path / "bag", 10)
     with BagReader(tmp_path / "bag") as reader:
         assert set(reader.columns("/output", ["effort"])) == {"log_time", "publish_time", "effort"}
-        with pytest.raises(BagError, match="no field 'torque': choose from .*effort"):
+        with pytest.raises(BagError, match=r"no field 'torque': choose from .*effort"):
             reader.columns("/output", ["torque"])
-        with pytest.raises(BagError, match="no topic '/input'"):
+        with pytest.raises(BagError, match=r"no topic '/input'"):
             reader.columns("/input")
 
 

@@ -155,7 +155,7 @@ def test_mutated_sqlite_bags_raise_nothing_but_bag_errors(tmp_path) -> None:
         "UPDATE topics SET name = CAST(x'ff' AS TEXT)",
         "UPDATE messages SET data = x'00' WHERE id = 5",
         "DROP TABLE messages",
-        "DROP TABLE messages; CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, x'' AS data",
+        "DROP TABLE messages; CREATE VIEW messages AS SELECT 1 id, 1 topic_id, 1 timestamp, x'' data",
     ],
 )
 def test_wrong_sqlite_content_is_refused(tmp_path, statement) -> None:
@@ -165,7 +165,7 @@ def test_wrong_sqlite_content_is_refused(tmp_path, statement) -> None:
             writer.write(topic, step, joint_state(step))
     with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
         database.executescript(statement)
-    with pytest.raises(BagError, match="bag.db3|topic"):
+    with pytest.raises(BagError, match=r"bag.db3|topic"):
         read_all(tmp_path / "bag")
 
 
@@ -221,18 +221,19 @@ def test_wrong_definitions_are_refused(text, reason) -> None:
 def test_exploding_definition_is_refused() -> None:
     types = [f"{'=' * 80}\nMSG: a/T{k}\nT{k + 1} x\nT{k + 1} y" for k in range(30)]
     text = "\n".join(["T0 x", *types, f"{'=' * 80}\nMSG: a/T30\nuint8 x"])
-    with pytest.raises(BagError, match="more than"):
+    with pytest.raises(BagError, match=r"more than"):
         parse("a/msg/B", text).paths()
-    with pytest.raises(BagError, match="of a message of"):
+    with pytest.raises(BagError, match=r"of a message of"):
         decode("a/msg/B", text, b"\0\1\0\0")
 
 
-@pytest.mark.parametrize(
-    "field", ["float64[4000000000]", "float64[]", "string[]", "Empty[]", "string", "Empty[9999999]"]
-)
+ABSURD = ["float64[4000000000]", "float64[]", "string[]", "Empty[]", "string", "Empty[9999999]"]
+
+
+@pytest.mark.parametrize("field", ABSURD)
 def test_absurd_lengths_in_a_message_are_refused(field) -> None:
     text = f"{field} x\n{'=' * 80}\nMSG: a/Empty\n"
-    with pytest.raises(BagError, match="length|field of"):
+    with pytest.raises(BagError, match=r"length|field of"):
         decode("a/msg/B", text, b"\0\1\0\0" + b"\xff\xff\xff\x7f" * 4)
 
 
@@ -331,7 +332,7 @@ def test_chunk_bombs_take_bounded_memory(tmp_path) -> None:
 def test_wrong_metadata_yaml_is_refused(tmp_path, content) -> None:
     write_bag(tmp_path / "bag", 10)
     (tmp_path / "bag" / "metadata.yaml").write_bytes(content)
-    with pytest.raises(BagError, match="metadata.*delete it"):
+    with pytest.raises(BagError, match=r"metadata.*delete it"):
         read_all(tmp_path / "bag")
 
 
@@ -344,7 +345,7 @@ def test_bag_without_metadata_yaml_opens(tmp_path) -> None:
 @pytest.mark.parametrize("name", ["missing", "missing.mcap", "missing.db3", "folder"])
 def test_no_bag_there(tmp_path, name) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(BagError, match="missing|folder"):
+    with pytest.raises(BagError, match=r"missing|folder"):
         BagReader(tmp_path / name)
 
 
@@ -357,5 +358,5 @@ def test_summary_that_tells_of_too_many_messages_is_refused(tmp_path) -> None:
     footer = records.record(records.FOOTER, struct.pack("<QQI", len(content), 0, 0))
     path = tmp_path / "liar.mcap"
     path.write_bytes(content + summary + footer + records.MAGIC)
-    with pytest.raises(BagError, match="more messages than fit"):
+    with pytest.raises(BagError, match=r"more messages than fit"):
         read_all(path)

@@ -1,0 +1,84 @@
+"""Between ROS messages and the loop's values."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from tdof_npid_ros.scenario import Plan
+
+SECOND = 1_000_000_000  # ns
+NO_VALUES = array("d")
+
+
+def stamp_ns(stamp: Time | Duration) -> int:
+    """A stamp or duration in ns."""
+    return int(stamp.sec * SECOND + stamp.nanosec)
+
+
+def set_stamp(stamp: Time | Duration, time_ns: int) -> None:
+    """Write a time in ns into a stamp or duration."""
+    stamp.sec, stamp.nanosec = divmod(time_ns, SECOND)
+
+
+def time_message(time_ns: int) -> Time:
+    """A stamp of a time in ns."""
+    sec, nanosec = divmod(time_ns, SECOND)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def values(field: array[float]) -> np.ndarray:
+    """A message's float64 field as an array that shares its memory."""
+    return np.frombuffer(field, dtype=np.float64)
+
+
+def as_field(values_: np.ndarray) -> array[float]:
+    """A copy of a float64 array for a message's field."""
+    return array("d", values_.tobytes())
+
+
+def plan_message(plan: Plan, start_ns: int) -> JointTrajectory:
+    """A plan as it is latched on `scenario_plan`; it starts at `start_ns` of the loop's time."""
+    header = Header(stamp=time_message(start_ns), frame_id=plan.digest)
+    message = JointTrajectory(header=header, joint_names=list(plan.names))
+    for time_ns, row in zip(plan.times_ns, plan.values, strict=True):
+        sec, nanosec = divmod(time_ns, SECOND)
+        message.points.append(JointTrajectoryPoint(positions=row, time_from_start=Duration(sec=sec, nanosec=nanosec)))
+    return message
+
+
+def plan_from_message(message: JointTrajectory) -> Plan:
+    """The plan that a message holds.
+
+    Raises:
+        PlanError: it is not a valid plan.
+    """
+    return Plan(
+        tuple(message.joint_names),
+        tuple(stamp_ns(point.time_from_start) for point in message.points),
+        tuple(tuple(point.positions) for point in message.points),
+    )
+
+
+def diagnostics_message(stamp: Time, name: str, level: int, text: str, facts: Mapping[str, object]) -> DiagnosticArray:
+    """One node's diagnostics."""
+    status = DiagnosticStatus(
+        level=bytes([level]),
+        name=name,
+        hardware_id=name,
+        message=text,
+        values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
+    )
+    return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+def signal_message(frame_id: str) -> JointState:
+    """An empty signal to fill and publish again and again."""
+    return JointState(header=Header(frame_id=frame_id))

@@ -1,0 +1,188 @@
+"""The scenario: plays the episodes of a parameter file, setpoint and disturbance."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from tdof_npid_ros.case import read_episodes, sample_period_in_ns
+from tdof_npid_ros.graph.messages import plan_message, set_stamp, signal_message, stamp_ns
+from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, run_node
+from tdof_npid_ros.graph.plant_node import MODES, STEADY
+from tdof_npid_ros.scenario import Plan, parse_plan
+
+
+class ScenarioNode(LoopNode):
+    """Latches each episode's plan on `scenario_plan` and publishes `setpoint` and `disturbance`.
+
+    In lockstep the plant starts an episode when its plan arrives and the next follows when the plant has finished it;
+    `setpoint` and `disturbance` are for onlookers then. In realtime they drive the loop.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("scenario")
+        self.period_ns = sample_period_in_ns(
+            self.declare_value("sample_period", 0.01, "s; time of one step", fixed=True)
+        )
+        self.mode = self.declare_value("mode", "realtime", "lockstep or realtime, as the plant", fixed=True)
+        if self.mode not in MODES:
+            raise ValueError(f"mode is {self.mode!r}: it must be one of {', '.join(MODES)}")
+        self.speed = float(
+            self.declare_value("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
+        )
+        self.play_at_start = bool(
+            self.declare_value("play", True, "play all episodes at the start; else at scenario/play")
+        )
+        self.declare_value("episodes", ["setpoint"], "names of the episodes, in the order in which they are played")
+        names = self.values_of(["episodes"])["episodes"]
+        for name in names:
+            self.declare_value(
+                f"plan.{name}", ["0 setpoint 1", "10 end"], f"lines of the episode {name}: TIME SIGNAL WHAT"
+            )
+        self._read_plans({})
+        self.accept_changes()
+        self.played = self.latest_episode = 0
+        self.queue: list[Plan] = []
+        self.current: Plan | None = None
+
+    def activate(self) -> None:
+        self.plan_publisher = self.create_publisher(JointTrajectory, "scenario_plan", LATCHED_QOS)
+        self.publishers_of = {
+            name: self.create_publisher(JointState, name, SIGNAL_QOS) for name in ("setpoint", "disturbance")
+        }
+        self.create_service(Trigger, "scenario/play", self._on_play)
+        self.plant_name = self.resolve_topic_name("plant")
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        if self.mode == "lockstep":
+            self.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
+        else:
+            self.reset_client = self.create_client(Trigger, "plant/reset")
+            self.parameter_client = self.create_client(SetParameters, "plant/set_parameters")
+            self.create_timer(self.period_ns / 1e9 / self.speed, self._on_tick, clock=STEADY)
+        if self.play_at_start:
+            self._play()
+
+    # Playing
+
+    def _on_play(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self.current is not None or self.queue:
+            response.success, response.message = False, "still playing"
+        else:
+            self._play()
+            response.success, response.message = True, f"playing {', '.join(self.plans)}"
+        return response
+
+    def _play(self) -> None:
+        self.queue = list(self.plans.values())
+        self._next()
+
+    def _next(self) -> None:
+        """Begin the next episode, if there is one."""
+        if not self.queue:
+            self.current = None
+            self.played += 1
+            self.get_logger().info("all episodes played")
+            self.publish_diagnostics()
+            return
+        self.current = self.queue.pop(0)
+        self.point, self.finished_before = -1, self.latest_episode
+        self.started_ns: int | None = None
+        if self.mode == "realtime":
+            self.reset_client.wait_for_service(timeout_sec=0.0)
+            self.reset_client.call_async(Trigger.Request())
+            self.started_ns = STEADY.now().nanoseconds
+        self.plan_publisher.publish(plan_message(self.current, 0))
+        self._advance_to(0)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name != self.plant_name:
+                continue
+            facts = {pair.key: pair.value for pair in status.values}
+            episode = int(facts.get("episode", 0))
+            finished = facts.get("state") == "finished" and facts.get("plan") == getattr(self.current, "digest", None)
+            if self.mode == "lockstep" and self.current and finished and episode > self.finished_before:
+                self.latest_episode = episode
+                self._advance_to(self.current.end_ns)
+                self._next()
+
+    def _on_clock(self, message: ClockMessage) -> None:
+        self._advance_to(stamp_ns(message.clock))
+
+    def _on_tick(self) -> None:
+        if self.current is None or self.started_ns is None:
+            return
+        now = int((STEADY.now().nanoseconds - self.started_ns) * self.speed)
+        self._advance_to(now)
+        if now >= self.current.end_ns:
+            self._next()
+
+    def _advance_to(self, time_ns: int) -> None:
+        """Publish what the plan does up to `time_ns`, each point once, stamped with its own time."""
+        plan = self.current
+        if plan is None:
+            return
+        while self.point + 1 < len(plan.times_ns) and plan.times_ns[self.point + 1] <= time_ns:
+            self.point += 1
+            row = dict(zip(plan.names, plan.values[self.point], strict=True))
+            self._publish_signals(plan.times_ns[self.point], row)
+            if self.mode == "realtime":
+                self._set_plant(
+                    {name.removeprefix("plant."): v for name, v in row.items() if name.startswith("plant.")}
+                )
+
+    def _publish_signals(self, time_ns: int, row: dict[str, float]) -> None:
+        for name, publisher in self.publishers_of.items():
+            message = signal_message("")
+            set_stamp(message.header.stamp, time_ns)
+            field = "position" if name == "setpoint" else "effort"
+            setattr(message, field, [row.get(name, 0.0)])
+            publisher.publish(message)
+
+    def _set_plant(self, parameters: dict[str, float]) -> None:
+        if parameters:
+            kind = ParameterType.PARAMETER_DOUBLE
+            request = SetParameters.Request()
+            request.parameters = [
+                Parameter(name=name, value=ParameterValue(type=kind, double_value=value))
+                for name, value in parameters.items()
+            ]
+            self.parameter_client.call_async(request)
+
+    # Parameters and state
+
+    def _read_plans(self, changes: dict[str, Any]) -> None:
+        names = self.values_of(["episodes"])["episodes"]
+        parameters = {"episodes": names, **self.values_of([f"plan.{name}" for name in names]), **changes}
+        self.plans = {}
+        for name, lines in read_episodes(parameters).items():
+            self.plans[name] = parse_plan(lines, self.period_ns)
+
+    def checked(self, changes: dict[str, Any]) -> None:
+        before = self.plans
+        try:
+            self._read_plans(changes)
+        finally:
+            self.plans = before
+
+    def changed(self, changes: dict[str, Any]) -> None:
+        self._read_plans(changes)
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        facts: dict[str, object] = {"state": "playing" if self.current else "idle", "played": self.played}
+        if self.current:
+            facts["plan"] = self.current.digest
+        return OK, str(facts["state"]), facts
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run_node(ScenarioNode, sys.argv if args is None else args)

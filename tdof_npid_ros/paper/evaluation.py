@@ -1,0 +1,128 @@
+"""Every row of the paper's tables in our loop: at the published gains, and at those that our HGA finds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.paper.tables import Published
+from tdof_npid_ros.tuning.study import GENERATIONS, tune_case
+
+CASE_TITLES = {
+    "p1-c0.5": "Process 1, c = 0.5",
+    "p1-c4": "Process 1, c = 4",
+    "p2-c2": "Process 2, c = 2",
+    "p2-c5": "Process 2, c = 5",
+    "p3-c1": "Process 3, c = 1",
+    "p3-c2": "Process 3, c = 2",
+    "sprott": "Sprott circuit",
+}
+CONTROLLER_TITLES = {"pid": "PID", "npid": "NPID", "tdof_npid1": "TDOF-NPID1", "tdof_npid2": "TDOF-NPID2"}
+METRICS = {
+    "overshoot_percent": "M_p (%)",
+    "settling_time_s": "t_s (s)",
+    "iae_setpoint": "IAE_SP (s)",
+    "peak": "M_peak",
+    "recovery_time_s": "t_rcy (s)",
+    "iae_disturbance": "IAE_DIS (s)",
+    "objective": "IAE_SP + IAE_DIS (s)",
+}
+SIGMA_FREE_CASES = ("p3-c1", "p3-c2")  # their published NPID rows are out of reach with σ = 1
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Gains and what they achieve in our loop; `values` by the names of `METRICS`, None for a time that is not."""
+
+    gains: Gains
+    values: dict[str, float | None]
+
+    def number(self, metric: str) -> float:
+        """A metric that always is."""
+        value = self.values[metric]
+        assert value is not None, metric
+        return value
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the paper.
+
+    Attributes:
+        published: as printed.
+        at_published: our loop with the printed gains.
+        tuned: our loop with the best gains of our HGA.
+        objectives: what the HGA reached with each seed, seed 0 first.
+        sigma_free: the best with σ tuned too, where that is done.
+    """
+
+    published: Published
+    at_published: Measured
+    tuned: Measured
+    objectives: tuple[float, ...]
+    sigma_free: Measured | None
+
+
+Rows = dict[tuple[str, str], Row]
+
+
+@lru_cache(maxsize=None)
+def paper_case(name: str) -> Case:
+    """A case of the paper, loaded once."""
+    return load_case(name)
+
+
+def published_gains(published: Published) -> Gains:
+    """The printed gains with the case's limits and anti-windup."""
+    values = {name: getattr(published.gains, name) for name in PER_LANE}
+    return paper_case(published.case).gains.with_values(type=published.controller, **values)
+
+
+def measure(case: Case, gains: Gains) -> Measured:
+    """The metrics of the case's setpoint and disturbance episodes."""
+    setpoint, disturbance = case.setpoint_response(gains), case.disturbance_response(gains)
+    return Measured(
+        gains,
+        {
+            "overshoot_percent": setpoint.overshoot_percent,
+            "settling_time_s": setpoint.settling_time_s,
+            "iae_setpoint": setpoint.iae,
+            "peak": disturbance.peak,
+            "recovery_time_s": disturbance.recovery_time_s,
+            "iae_disturbance": disturbance.iae,
+            "objective": setpoint.iae + case.weight * disturbance.iae,
+        },
+    )
+
+
+def evaluate_row(published: Published, seeds: int, generations: int = GENERATIONS) -> Row:
+    """One row: measured at the printed gains, and tuned with seeds 0 … seeds - 1.
+
+    Args:
+        generations: of each HGA run.
+    """
+    case = paper_case(published.case)
+    results = [tune_case(case, published.controller, seed=seed, generations=generations) for seed in range(seeds)]
+    free = published.case in SIGMA_FREE_CASES and published.controller != "pid"
+    return Row(
+        published,
+        measure(case, published_gains(published)),
+        measure(case, min(results, key=lambda result: result.objective).gains),
+        tuple(result.objective for result in results),
+        _sigma_free(published, case, range(seeds), generations) if free else None,
+    )
+
+
+def _sigma_free(published: Published, case: Case, seeds: Sequence[int], generations: int) -> Measured:
+    results = [
+        tune_case(case, published.controller, seed=seed, extra=("sigma",), generations=generations) for seed in seeds
+    ]
+    return measure(case, min(results, key=lambda result: result.objective).gains)
+
+
+def deviation_percent(ours: float | None, published: float | None) -> float | None:
+    """How far ours is from the published value, in per cent of it; None where there is no such number."""
+    return None if ours is None or not published else 100.0 * (ours / published - 1.0)

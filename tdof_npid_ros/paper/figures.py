@@ -1,0 +1,121 @@
+"""The paper's figures, drawn: data in, one PNG out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES
+from tdof_npid_ros.tuning.pareto import Front
+
+STYLE: dict[str, dict[str, Any]] = {
+    "pid": {"color": "#2f5d8a", "linestyle": "-", "marker": "o"},
+    "npid": {"color": "#8a5fb0", "linestyle": ":", "marker": "s"},
+    "tdof_npid1": {"color": "#e07b1f", "linestyle": "--", "marker": "^"},
+    "tdof_npid2": {"color": "#2a9a68", "linestyle": "-.", "marker": "v"},
+}
+REFERENCE = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
+WIDTH = 10.0  # inches
+DPI = 120
+
+
+class Curve(NamedTuple):
+    """One response: time (s) and value, of one length."""
+
+    controller: str
+    time: np.ndarray
+    value: np.ndarray
+
+
+class Panel(NamedTuple):
+    """One set of axes with the responses of several controllers.
+
+    Attributes:
+        reference: where the response should be; a thin line.
+        scale: what the values are multiplied by for the picture; the label says so.
+    """
+
+    title: str
+    ylabel: str
+    curves: Sequence[Curve]
+    until: float
+    reference: float | None = None
+    scale: float = 1.0
+
+
+def draw_panels(rows: Sequence[Sequence[Panel]], path: Path) -> None:
+    """A grid of responses."""
+    canvas, axes = _canvas(len(rows), len(rows[0]), 3.1)
+    for row, row_axes in zip(rows, axes, strict=True):
+        for panel, ax in zip(row, row_axes, strict=True):
+            _draw_panel(panel, ax)
+    axes[0][0].legend(loc="best", frameon=False)
+    canvas.savefig(path)
+
+
+def draw_error_scaling(error: np.ndarray, scaled: Mapping[float, np.ndarray], path: Path) -> None:
+    """Figure 1: ζ over e for several σ, each of shape (errors,)."""
+    canvas, axes = _canvas(1, 1, 4.0, width=6.5)
+    ax = axes[0][0]
+    ax.plot(error, error, color="#999999", linewidth=0.8, label="ζ = e (linear)")
+    for (sigma, value), color in zip(scaled.items(), ("#2f5d8a", "#e07b1f", "#2a9a68"), strict=True):
+        ax.plot(error, value, color=color, label=f"σ = {sigma:g}")
+    ax.set(xlabel="error e", ylabel="scaled error ζ", ylim=(-2.5, 2.5), xlim=(error[0], error[-1]))
+    ax.legend(frameon=False)
+    canvas.savefig(path)
+
+
+def draw_fronts(fronts: Sequence[Front], path: Path) -> None:
+    """Figure 6: the fronts of each ratio L/T in axes of their own."""
+    ratios = sorted({front.ratio for front in fronts})
+    canvas, axes = _canvas(1, len(ratios), 3.8)
+    for ratio, ax in zip(ratios, axes[0], strict=True):
+        for front in (front for front in fronts if front.ratio == ratio):
+            style = STYLE[front.controller]
+            ax.plot(*front.iae.T, linewidth=0.8, markersize=3.0, label=CONTROLLER_TITLES[front.controller], **style)
+        ax.set(title=f"L/T = {ratio:g}", xlabel="IAE_SP (s)", ylabel="IAE_DIS (s)")
+    axes[0][-1].legend(frameon=False)
+    canvas.savefig(path)
+
+
+def draw_chaos(time: np.ndarray, x1: np.ndarray, x2: np.ndarray, path: Path) -> None:
+    """Figure 13: the phase portrait and the output of the circuit left alone."""
+    canvas, axes = _canvas(1, 2, 3.8)
+    portrait, series = axes[0]
+    portrait.plot(x1, x2, color="#2f5d8a", linewidth=0.5)
+    portrait.plot(x1[0], x2[0], "o", color="#c0392b", markersize=5, label="start")
+    portrait.set(title="(a) phase portrait", xlabel="x₁", ylabel="x₂")
+    portrait.legend(frameon=False)
+    series.plot(time, x1, color="#2f5d8a", linewidth=0.8)
+    series.set(title="(b) output", xlabel="time (s)", ylabel="y = x₁", xlim=(time[0], time[-1]))
+    canvas.savefig(path)
+
+
+def _draw_panel(panel: Panel, ax: Axes) -> None:
+    if panel.reference is not None:
+        ax.axhline(panel.reference * panel.scale, **REFERENCE)
+    for curve in panel.curves:
+        shown = curve.time <= panel.until
+        style = {name: STYLE[curve.controller][name] for name in ("color", "linestyle")}
+        value = curve.value[shown] * panel.scale
+        ax.plot(curve.time[shown], value, linewidth=1.4, label=CONTROLLER_TITLES[curve.controller], **style)
+    ax.set(title=panel.title, xlabel="time (s)", ylabel=panel.ylabel, xlim=(panel.curves[0].time[0], panel.until))
+
+
+def _canvas(rows: int, columns: int, height: float, width: float = WIDTH) -> tuple[Canvas, list[list[Axes]]]:
+    canvas = Canvas(figsize=(width, height * rows), dpi=DPI, layout="constrained")
+    axes = canvas.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.grid(True, color="#e6e6e6", linewidth=0.6)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.title.set_fontsize(10)
+    return canvas, axes.tolist()

@@ -1,0 +1,53 @@
+"""The compiled step of a plant by itself, for all its lanes: what the plant node calls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.plants.kernels import plant_advance, plant_input, plant_output
+from tdof_npid_ros.plants.states import either, loaded, store
+
+DIVERGED = 1e100  # |y| beyond it: the lane stays where it was, so that no infinity ever appears
+
+
+@compiled
+def advance_sound(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
+    """The plant's state one step on, and whether the lane is sound; a lane that diverges stays where it was."""
+    moved = plant_advance(plant, x, v_old, v_new, d)
+    sound = abs(plant_output(plant, moved)) < DIVERGED
+    return either(sound, moved, x), sound
+
+
+@compiled
+def applied(u: Any, limits: Any) -> Any:
+    """The effort after the plant's own limits."""
+    return min(max(u, limits[0]), limits[1])
+
+
+@entry_point
+def output_lanes(plant: Any, like: Any, x: np.ndarray, y: np.ndarray) -> None:
+    """The output y (lanes,) of every lane; x is flat, (states * lanes,), `like` a tuple as long as a state."""
+    lanes = y.shape[0]
+    for j in range(lanes):
+        y[j] = plant_output(plant, loaded(like, x, j, lanes))
+
+
+@entry_point
+def advance_lanes(
+    plant: Any, like: Any, x: Any, ring: Any, step: Any, limits: Any, u: Any, d: Any, u_applied: Any, y: Any
+) -> None:
+    """One step of every lane: x and ring advance, the effort applied and the next output are written."""
+    lanes = y.shape[0]
+    size = plant.delay + 2
+    new, oldest, due = step % size, (step + 1) % size, (step + 2) % size
+    for j in range(lanes):
+        u_applied[j] = applied(u[j], limits)
+        ring[new * lanes + j] = plant_input(plant, u_applied[j], d[j])
+        state, _ = advance_sound(
+            plant, loaded(like, x, j, lanes), ring[oldest * lanes + j], ring[due * lanes + j], d[j]
+        )
+        store(state, x, j, lanes)
+        y[j] = plant_output(plant, state)

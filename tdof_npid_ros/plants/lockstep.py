@@ -1,0 +1,52 @@
+"""An episode of a simulated plant in lockstep: which stamp it waits for, and what happens when it is answered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.scenario import Plan
+
+PlantAt = Callable[[dict[str, float]], Plant]
+
+
+class Episode:
+    """One run of a plan by a plant that takes only the answer to its latest output.
+
+    Attributes:
+        name: `<plan digest>/<number>`, what outputs bear in `header.frame_id`.
+        steps: number of steps; the outputs are those of steps 0 to `steps`.
+        stamp_ns: of the output that waits for an answer.
+    """
+
+    def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, number: int) -> None:
+        signals = plan.sampled(simulator.sample_period_ns)
+        self.name = f"{plan.digest}/{number}"
+        self.steps = signals.steps
+        self.stamp_ns = 0
+        self._simulator = simulator
+        self._disturbance = signals.disturbance
+        self._row = np.zeros(simulator.lanes)
+        self._plants = {segment.first: plant_at(segment.plant) for segment in signals.segments}
+        self._k = 0
+
+    def awaits(self, stamp_ns: int, answer_name: str) -> bool:
+        """Whether an answer of that stamp is the one; an answer that names an episode must name this one."""
+        return stamp_ns == self.stamp_ns and ("/" not in answer_name or answer_name.endswith(self.name))
+
+    def answer(self, effort: np.ndarray) -> bool:
+        """Take the answer, (lanes,), and go on one step. Returns False if the episode ends with it."""
+        k = self._k
+        if k == self.steps:
+            return False
+        plant = self._plants.get(k)
+        if plant is not None:
+            self._simulator.change_plant(plant)
+        self._row.fill(self._disturbance[k])
+        self._simulator.advance(effort, self._row)
+        self._k = k + 1
+        self.stamp_ns += self._simulator.sample_period_ns
+        return True

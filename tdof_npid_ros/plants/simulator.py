@@ -1,0 +1,51 @@
+"""A plant that is stepped: the state of all lanes and the compiled step, for the plant node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.plants.lanes import advance_lanes, output_lanes
+from tdof_npid_ros.plants.plant import Plant
+
+
+class PlantSimulator:
+    """A plant's lanes in simulation; every lane has the same parameters and its own effort.
+
+    Attributes:
+        output: y, (lanes,).
+        applied_effort: u of the latest step after the plant's limits, (lanes,).
+    """
+
+    def __init__(self, plant: Plant, sample_period_ns: int, lanes: int, effort_limits: tuple[float, float]) -> None:
+        self.lanes = lanes
+        self.sample_period_ns = sample_period_ns
+        self.effort_limits = effort_limits
+        self._initial = plant
+        self.change_plant(plant)
+        self.reset()
+
+    def change_plant(self, plant: Plant) -> None:
+        """Go on with other parameters; the state is kept."""
+        self._sampled: Any = plant.sampled(self.sample_period_ns)
+        self._like = plant.initial_state
+
+    def reset(self, plant: Plant | None = None) -> None:
+        """Back to the initial state at time 0, with the parameters of `plant`, by default those at the start."""
+        plant = plant or self._initial
+        self.change_plant(plant)
+        self._x = np.repeat(np.array(plant.initial_state), self.lanes)
+        self._ring = np.zeros((self._sampled.delay + 2) * self.lanes)
+        self._step = 0
+        self.applied_effort = np.zeros(self.lanes)
+        self.output = np.zeros(self.lanes)
+        output_lanes(self._sampled, self._like, self._x, self.output)
+
+    def advance(self, effort: np.ndarray, disturbance: np.ndarray) -> None:
+        """One step on, under `effort` and `disturbance`, (lanes,) each, held."""
+        advance_lanes(
+            self._sampled, self._like, self._x, self._ring, self._step, self.effort_limits,
+            effort, disturbance, self.applied_effort, self.output,
+        )  # fmt: skip
+        self._step += 1

@@ -1,0 +1,102 @@
+"""The objective (10) of candidate gains: IAE = IAE_SP + w·IAE_DIS, whole populations at a time, on all cores.
+
+`objective_values` is the formula alone: the live tuner gives it the integrals that it measured over ROS 2 and gets the
+same bits (E3).
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from tdof_npid_ros.control.gains import gains_from_candidates
+from tdof_npid_ros.loop import VECTOR, Integrals
+from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
+
+LARGEST_IAE = 1e6
+"""unit·s: an IAE above it is compressed; such a loop is useless, and only its place in the order matters."""
+
+_DOUBLINGS = 1024.0  # of LARGEST_IAE within the range of a float: a compressed IAE stays below 2·LARGEST_IAE
+_DIVERGED = 3.0  # penalty / LARGEST_IAE of a lane that diverged at once; it falls to 2 for one that nearly did not
+
+
+def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float) -> Array:
+    """Equation (10) per lane, (lanes,): always finite, and the better the lower.
+
+    In each episode a lane that diverged costs more than any that did not, and the more the earlier it diverged.
+
+    Args:
+        setpoint, disturbance: of the two episodes, (lanes,) each.
+        weight: w.
+    """
+    return _cost(setpoint) + weight * _cost(disturbance)
+
+
+def _cost(integrals: Integrals) -> Array:
+    share = integrals.sound_share
+    sound = (share >= 1.0) & np.isfinite(integrals.iae)
+    iae = np.where(sound, integrals.iae, 0.0)
+    return np.where(sound, _compressed(iae), LARGEST_IAE * (_DIVERGED - share))
+
+
+def _compressed(iae: Array) -> Array:
+    """The IAE itself up to LARGEST_IAE, above it like a logarithm; drawn in straight lines, without the C library."""
+    mantissa, exponent = np.frexp(np.maximum(iae / LARGEST_IAE, 1.0))
+    doublings = (exponent - 1) + (2.0 * mantissa - 1.0)
+    return np.where(iae > LARGEST_IAE, LARGEST_IAE * (1.0 + doublings / _DOUBLINGS), iae)
+
+
+class Objective:
+    """The objective of a problem's candidates, computed in process.
+
+    Its values do not depend on the number of threads: lanes are independent, and each is summed in the order of time.
+    """
+
+    def __init__(self, problem: TuningProblem, threads: int | None = None) -> None:
+        """
+        Args:
+            threads: by default one per core.
+        """
+        self._problem = problem
+        self._threads = threads or available_cores()
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="objective")
+        _ = problem.case.signals  # sampled once, before the threads
+
+    def __call__(self, candidates: Array) -> Array:
+        """Values (n,) of candidates (n, len(problem.names)).
+
+        Raises:
+            GainsError: a candidate is not a valid set of gains.
+        """
+        setpoint, disturbance = self.integrals(candidates)
+        return objective_values(setpoint, disturbance, self._problem.weight)
+
+    def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
+        """Of the setpoint and the disturbance episode, (n,) each."""
+        problem = self._problem
+        blocks = [
+            gains_from_candidates(problem.base, problem.names, candidates[block])
+            for block in _blocks(len(candidates), self._threads)
+        ]
+        running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
+        setpoint, disturbance = (_joined([block.result() for block in episode]) for episode in running)
+        return setpoint, disturbance
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
+def _blocks(lanes: int, threads: int) -> list[slice]:
+    """Lanes in blocks of what the loop vectorises best, so that the episodes of each give every thread something."""
+    count = -(-threads // len(EPISODES))
+    size = max(2 * VECTOR, -(-lanes // (count * VECTOR)) * VECTOR)
+    return [slice(first, min(first + size, lanes)) for first in range(0, lanes, size)]
+
+
+def _joined(blocks: list[Integrals]) -> Integrals:
+    return Integrals(np.concatenate([b.iae for b in blocks]), np.concatenate([b.sound_share for b in blocks]))

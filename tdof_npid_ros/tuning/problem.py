@@ -1,0 +1,114 @@
+"""A tuning problem: the case, what of its controller is free, and how the search is done."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from tdof_npid_ros.case import Bounds, Case
+from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains
+from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.ask_tell import Array
+
+EPISODES = ("setpoint", "disturbance")
+"""IAE_SP and IAE_DIS of the objective (10) are those of these episodes of the case."""
+
+POPULATION, GENERATIONS = 40, 200
+"""By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""
+
+
+@dataclass(frozen=True)
+class TuningProblem:
+    """All that the outcome of a study depends on.
+
+    Attributes:
+        case: the loop, with its search bounds.
+        controller: the type that is tuned.
+        extra: what is free beyond the gains that the paper tunes for the type: `sigma`, or nothing.
+        weight: w of the objective (10).
+        algorithm: `hga`, `de` or `cmaes`.
+        seed: of the optimiser's random numbers.
+        population, generations: their product is the budget of evaluations.
+
+    Raises:
+        TuningError: the case lacks an episode or bounds, or its bounds allow gains that no controller takes.
+    """
+
+    case: Case
+    controller: ControllerType
+    extra: tuple[str, ...] = ()
+    weight: float = 1.0
+    algorithm: str = "hga"
+    seed: int = 0
+    population: int = POPULATION
+    generations: int = GENERATIONS
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.weight < math.inf:
+            raise TuningError(f"weight is {self.weight}: it must be finite and not below 0")
+        if self.extra not in ((), ("sigma",)) or (self.extra and self.controller == "pid"):
+            raise TuningError(f"{', '.join(self.extra)} cannot be freed for {self.controller}: only sigma, not for pid")
+        missing = [episode for episode in EPISODES if episode not in self.case.episodes]
+        if missing:
+            raise TuningError(f"{self.case.name} has no episode {missing[0]!r}: tuning runs {' and '.join(EPISODES)}")
+        missing = [name for name in self.names if name not in self.case.bounds]
+        if missing:
+            raise TuningError(f"{self.case.name} has no bounds.{missing[0]}: give [lower, upper] to its tuner")
+        self._check_bounds()
+
+    def _check_bounds(self) -> None:
+        bounds = dict(zip(self.names, self.bounds, strict=True))
+        kp, ki, kd = (bounds[name] for name in ("kp", "ki", "kd"))
+        direct = kp[0] > 0 and ki[0] >= 0 and kd[0] >= 0
+        reverse = kp[1] < 0 and ki[1] <= 0 and kd[1] <= 0
+        if not (direct or reverse):
+            raise TuningError(
+                f"{self.case.name}: bounds kp {list(kp)}, ki {list(ki)}, kd {list(kd)} hold gains that no controller "
+                "takes: kp must stay above 0 and ki, kd must not fall below it (reverse action: the other way round)"
+            )
+        if "sigma" in bounds and bounds["sigma"][0] <= 0:
+            raise TuningError(f"{self.case.name}: bounds sigma {list(bounds['sigma'])}: it must stay above 0")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The free gains, in the order of a candidate's columns."""
+        return (*TUNED[self.controller], *self.extra)
+
+    @property
+    def bounds(self) -> tuple[Bounds, ...]:
+        """Lower and upper bound of each free gain."""
+        return tuple(self.case.bounds[name] for name in self.names)
+
+    @cached_property
+    def base(self) -> Gains:
+        """The controller with what is not free; alpha and beta are 0 where the type has none."""
+        unused = {name: 0.0 for name in ("alpha", "beta") if name not in TUNED[self.controller]}
+        return self.case.gains.with_values(type=self.controller, **unused)
+
+    def gains(self, candidate: Array) -> Gains:
+        """The gains of one candidate, (len(names),)."""
+        return self.base.with_values(**dict(zip(self.names, candidate.tolist(), strict=True)))
+
+    def description(self) -> dict[str, Any]:
+        """The problem, flat and as JSON holds it: two problems are the same if their descriptions are."""
+        case = self.case
+        plant = {name: case.plant_values.get(name, value) for name, value in model_parameters(case.model).items()}
+        fixed = {name: value for name, value in self.base.as_dict().items() if name not in (*self.names, "type")}
+        return {
+            "model": case.model,
+            **{f"plant.{name}": value for name, value in plant.items()},
+            "plant.effort_limits": str(case.effort_limits),  # may be infinite, which JSON does not know
+            "sample_period_ns": case.sample_period_ns,
+            **{f"plan.{episode}": case.plans[episode].digest for episode in EPISODES},
+            "controller": self.controller,
+            **{f"controller.{name}": str(value) for name, value in fixed.items()},
+            **{f"bounds.{name}": list(bounds) for name, bounds in zip(self.names, self.bounds, strict=True)},
+            "weight": self.weight,
+            "algorithm": self.algorithm,
+            "seed": self.seed,
+            "population": self.population,
+            "generations": self.generations,
+        }

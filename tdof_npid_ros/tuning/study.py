@@ -1,0 +1,200 @@
+"""A study: a tuning problem, its optimiser, and the checkpoint that it can be resumed from.
+
+It is asked for candidates and told their values, so one study serves the offline tuner and the live one:
+
+    study = Study(problem, checkpoint)
+    study.run(Objective(problem))        # or, anywhere else: study.tell(measured(study.ask())) until study.done
+    study.result.gains
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import ControllerType, Gains
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
+from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.optimizers import make_optimizer, restore_optimizer
+from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
+
+
+class Improvement(NamedTuple):
+    """A generation that found a better candidate, for the convergence plot."""
+
+    generation: int
+    evaluations: int
+    value: float
+
+
+@dataclass(frozen=True)
+class TuningResult:
+    """What a study has found so far.
+
+    Attributes:
+        gains: the best candidate's.
+        objective: its value (10).
+        evaluations: candidates evaluated in all.
+        improvements: how it got there.
+    """
+
+    gains: Gains
+    objective: float
+    evaluations: int
+    improvements: tuple[Improvement, ...]
+
+
+class Study:
+    """One tuning run; the outcome depends on the problem alone, however often it is stopped and resumed (E4)."""
+
+    def __init__(self, problem: TuningProblem, checkpoint: Path | None = None, resume: bool = False) -> None:
+        """
+        Args:
+            checkpoint: written now and after each generation.
+            resume: go on from the checkpoint if there is one.
+
+        Raises:
+            TuningError: the problem cannot be searched; the checkpoint is of another problem, damaged or of a newer
+                version; or it is there but not to be resumed. Nothing is overwritten.
+        """
+        self.problem = problem
+        self._checkpoint = checkpoint
+        self._improvements: list[Improvement] = []
+        self._optimizer = self._new_optimizer()
+        if checkpoint is None:
+            return
+        if not checkpoint.exists():
+            self._save()
+        elif resume:
+            self._restore(checkpoint)
+        else:
+            raise TuningError(f"checkpoint {checkpoint} exists: resume it, or give another file")
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget is spent."""
+        return self._optimizer.done
+
+    @property
+    def generation(self) -> int:
+        """Generations told."""
+        return self._optimizer.generation
+
+    @property
+    def evaluations(self) -> int:
+        """Candidates told."""
+        return self._optimizer.evaluations
+
+    @property
+    def budget(self) -> int:
+        """Candidates that the study ends after."""
+        return self._optimizer.budget
+
+    @property
+    def best_value(self) -> float:
+        """The lowest value so far; infinite before the first generation."""
+        return self._optimizer.best_value
+
+    @property
+    def result(self) -> TuningResult:
+        """The best so far. Raises TuningError before the first generation."""
+        gains = self.problem.gains(self._optimizer.best_x)
+        return TuningResult(gains, self.best_value, self.evaluations, tuple(self._improvements))
+
+    def ask(self) -> Array:
+        """The generation's candidates, (n, len(problem.names)); the same ones until they are told."""
+        return self._optimizer.ask()
+
+    def tell(self, values: Array) -> None:
+        """Take the values (n,) of the candidates asked, and save the checkpoint.
+
+        Raises:
+            TuningError: not one finite value per candidate, or the checkpoint cannot be written.
+        """
+        before = self.best_value
+        self._optimizer.tell(values)
+        if self.best_value < before:
+            self._improvements.append(Improvement(self.generation, self.evaluations, self.best_value))
+        self._save()
+
+    def run(self, evaluate: Callable[[Array], Array], after_generation: Callable[[Study], bool] | None = None) -> None:
+        """Run until the budget is spent, or until `after_generation` returns False.
+
+        Args:
+            evaluate: candidates (n, d) to their values (n,).
+            after_generation: called with the study after each generation; whether to go on.
+        """
+        while not self.done:
+            self.tell(evaluate(self.ask()))
+            if after_generation is not None and not after_generation(self):
+                return
+
+    def _new_optimizer(self) -> Optimizer:
+        problem = self.problem
+        lower, upper = zip(*problem.bounds, strict=True)
+        return make_optimizer(
+            problem.algorithm,
+            lower,
+            upper,
+            seed=problem.seed,
+            population=problem.population,
+            generations=problem.generations,
+        )
+
+    def _save(self) -> None:
+        if self._checkpoint is not None:
+            content = {
+                "problem": self.problem.description(),
+                "improvements": self._improvements,
+                "optimizer": self._optimizer.state(),
+            }
+            write_checkpoint(self._checkpoint, content)
+
+    def _restore(self, path: Path) -> None:
+        content = read_checkpoint(path)
+        here = self.problem.description()
+        there = content.get("problem")
+        if there != here:
+            raise TuningError(f"checkpoint {path} is of another problem: {_difference(there, here)}")
+        try:
+            self._improvements = [Improvement(*one) for one in content["improvements"]]
+            self._optimizer = restore_optimizer(content["optimizer"])
+        except (KeyError, TypeError, TuningError) as error:
+            raise TuningError(f"checkpoint {path} is damaged, start anew with another file: {error}") from None
+
+
+def _difference(there: Any, here: dict[str, Any]) -> str:
+    """What differs between two problems' descriptions, the first such thing."""
+    if not isinstance(there, dict):
+        return "it describes none"
+    key = next(key for key in (*here, *there) if there.get(key) != here.get(key))
+    return f"{key} is {there.get(key)} there and {here.get(key)} here"
+
+
+def tune_case(
+    case: Case,
+    controller: ControllerType,
+    *,
+    seed: int = 0,
+    extra: tuple[str, ...] = (),
+    algorithm: str = "hga",
+    population: int = POPULATION,
+    generations: int = GENERATIONS,
+) -> TuningResult:
+    """Tune one controller type on a case, in process, with the case's bounds and weight.
+
+    Args:
+        extra: `("sigma",)` to free sigma too.
+
+    Raises:
+        TuningError: see `TuningProblem`.
+    """
+    problem = TuningProblem(case, controller, extra, case.weight, algorithm, seed, population, generations)
+    study = Study(problem)
+    study.run(Objective(problem))
+    return study.result
