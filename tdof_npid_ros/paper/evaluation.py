@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import PER_LANE, Gains
 from tdof_npid_ros.paper.tables import Published
-from tdof_npid_ros.tuning.study import GENERATIONS, tune_case
+from tdof_npid_ros.tuning.problem import GENERATIONS
+from tdof_npid_ros.tuning.study import tune_case
 
 CASE_TITLES = {
     "p1-c0.5": "Process 1, c = 0.5",
@@ -69,7 +70,7 @@ class Row:
 Rows = dict[tuple[str, str], Row]
 
 
-@lru_cache(maxsize=None)
+@cache
 def paper_case(name: str) -> Case:
     """A case of the paper, loaded once."""
     return load_case(name)

@@ -23,7 +23,7 @@ STYLE: dict[str, dict[str, Any]] = {
     "tdof_npid1": {"color": "#e07b1f", "linestyle": "--", "marker": "^"},
     "tdof_npid2": {"color": "#2a9a68", "linestyle": "-.", "marker": "v"},
 }
-REFERENCE = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
+REFERENCE: dict[str, Any] = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
 WIDTH = 10.0  # inches
 DPI = 120
 

@@ -23,7 +23,6 @@ from tdof_npid_ros.paper.evaluation import (
 from tdof_npid_ros.paper.figures import Curve, Panel
 from tdof_npid_ros.paper.report import Cell, Figure, Table
 from tdof_npid_ros.paper.tables import COMPARED, VARIATIONS
-from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.tuning.pareto import Front
 
 CHANGE_AT = 5.0  # s: when `a` changes (Table 9, Figures 15 and 16)
@@ -112,7 +111,10 @@ def variation_table(name: str) -> Item:
                 variation_metrics(tuned, published.a, CHANGE_AT),
             )
             key = (f"a = 0.6 → {published.a:g}", CONTROLLER_TITLES[published.controller])
-            for quantity, printed, index in (("M_peak (×10⁻³)", published.peak, 0), ("IAE (×10⁻³ s)", published.iae, 1)):
+            for quantity, printed, index in (
+                ("M_peak (×10⁻³)", published.peak, 0),
+                ("IAE (×10⁻³ s)", published.iae, 1),
+            ):
                 values = [one[index] for one in ours]
                 cells = [x for v in values for x in (v * 1e3, deviation_percent(v, printed))]
                 rows.append((*key, quantity, printed * 1e3, *cells))
@@ -180,15 +182,16 @@ def variation_figure(name: str, a: float) -> Item:
         case, rows = paper_case("sprott"), _rows(evaluated, ("sprott",))
         episode = VARIATION_EPISODES[a]
         time = case.signals[episode].time
-        whole = [Curve(r.published.controller, time, case.simulate(episode, r.at_published.gains).output[:, 0]) for r in rows]
-        tuned = [Curve(r.published.controller, time, case.simulate(episode, r.tuned.gains).output[:, 0]) for r in rows]
+        whole, tuned = (
+            [Curve(one.type, time, case.simulate(episode, one).output[:, 0]) for one in gains]
+            for gains in ([row.at_published.gains for row in rows], [row.tuned.gains for row in rows])
+        )
         rest = [_from_rest(row, a) for row in rows]
-        effect = f"y - 1 after the change, at rest before (×10⁻³), a → {a:g}"
         panels = [
             [
                 Panel("(a) published gains; a changes at 5 s", "y", whole, 10.0, 1.0),
                 Panel("(b) our tuned gains; a changes at 5 s", "y", tuned, 10.0, 1.0),
-                Panel("(c) its effect alone, published gains", effect.split(",")[0] + " (×10⁻³)", rest, 15.0, 0.0, 1e3),
+                Panel("(c) its effect alone, published gains", "(y - 1)·10³", rest, 15.0, 0.0, 1e3),
             ]
         ]
         every = max(1, len(time) // DATA_ROWS)
@@ -268,7 +271,7 @@ def chaos_figure(name: str) -> Item:
     return Item((), build)
 
 
-def variation_metrics(gains: Gains, a: float, change_at: float) -> tuple[float, float, float | None]:
+def variation_metrics(gains: Gains, a: float, change_at: float) -> tuple[float, float, float]:
     """M_peak, IAE (s) and the time (s, from the change) to within 5 % of M_peak, from the change on."""
     deviation = np.abs(variation_response(gains, a, change_at))
     period = paper_case("sprott").sample_period

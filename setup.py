@@ -1,0 +1,47 @@
+"""Packaging, for colcon (ament_python) and for pip."""
+
+import sys
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "tdof_npid_ros"
+NODES = ["plant", "controller", "scenario", "tuner", "recorder", "replay"]
+
+# `ros2 run` finds a node by the name of its executable in lib/tdof_npid_ros, where colcon puts it. Under pip such
+# executables would land in bin/, where names like `plant` belong to nobody: there, `python -m tdof_npid_ros.graph plant`.
+by_colcon = "install" in sys.argv or "develop" in sys.argv
+node_scripts = [f"{node} = {NAME}.graph.{node}_node:main" for node in NODES] if by_colcon else []
+
+ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+PAPER = ["pymoo>=0.6", "cma>=4"]
+TEST = [
+    "pytest>=8", "pytest-timeout", "hypothesis", "ruff", "mypy", "types-PyYAML", "scipy-stubs",
+    "rosbags", "mcap-ros2-support",
+    "colcon-core", "colcon-ros", "colcon-package-selection", "colcon-bash", "colcon-recursive-crawl", "setuptools<80",
+]  # fmt: skip
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Nonlinear two-degree-of-freedom PID control loops as ROS 2 nodes",
+    license="Apache-2.0",
+    maintainer="the tdof_npid_ros developers",
+    maintainer_email="tdof-npid-ros@example.org",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed", "paper/*.csv", "analysis/*.js", "analysis/*.html", "analysis/*.css"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", glob("config/*.*")),
+        (f"share/{NAME}/launch", glob("launch/*.launch.py")),
+    ],
+    python_requires=">=3.10",
+    install_requires=[
+        "numpy>=1.26", "scipy>=1.11", "numba>=0.59", "mpmath>=1.3", "PyYAML>=6", "mcap>=1.1", "zstandard>=0.22",
+        "lz4>=4", "matplotlib>=3.6", "tqdm>=4.60",
+    ],  # fmt: skip
+    extras_require={"ros": ROS, "paper": PAPER, "test": [*TEST, *PAPER]},
+    entry_points={"console_scripts": [f"tdof-npid = {NAME}.cli:entry", *node_scripts]},
+    zip_safe=False,
+)

@@ -1,0 +1,5 @@
+"""What bags tell: episodes, metrics, comparison with the in-process simulation, and E2. Knows files, no ROS."""
+
+from tdof_npid_ros.analysis.errors import AnalysisError
+
+__all__ = ["AnalysisError"]

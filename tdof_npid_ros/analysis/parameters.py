@@ -1,0 +1,94 @@
+"""The parameters that nodes had, from a bag's `/parameter_events`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.case import sample_period_in_ns
+from tdof_npid_ros.control.controller import parameters_digest
+from tdof_npid_ros.control.gains import Gains, gains_from_mapping
+
+TOPIC = "/parameter_events"
+# The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.
+_VALUE_FIELDS = {
+    1: "bool_value",
+    2: "integer_value",
+    3: "double_value",
+    4: "string_value",
+    5: "byte_array_value",
+    6: "bool_array_value",
+    7: "integer_array_value",
+    8: "double_array_value",
+    9: "string_array_value",
+}
+
+
+@dataclass(frozen=True)
+class ParameterHistory:
+    """What became of one node's parameters.
+
+    Attributes:
+        node: its full name.
+        events: times (ns since the epoch) and what was set then, in the order of the times.
+    """
+
+    node: str
+    events: tuple[tuple[int, Mapping[str, Any]], ...]
+
+    def sets(self) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Yield each time something was set, with all that was known then."""
+        values: dict[str, Any] = {}
+        for time_ns, changes in self.events:
+            values = {**values, **changes}
+            yield time_ns, values
+
+    def at(self, time_ns: int) -> dict[str, Any]:
+        """All parameters at a time; what was asked for only later counts as having been so from the start."""
+        known: dict[str, Any] = {}
+        for when, changes in self.events:
+            known = {**known, **changes} if when <= time_ns else {**changes, **known}
+        return known
+
+
+def read_histories(reader: BagReader) -> dict[str, ParameterHistory]:
+    """The parameter history of each node in a bag, by the node's full name.
+
+    Raises:
+        BagError: the bag is damaged.
+    """
+    if TOPIC not in reader.topics:
+        return {}
+    columns = reader.columns(TOPIC, ["node", "new_parameters", "changed_parameters"])
+    events: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    # By publish time, not by arrival: a snapshot bears the time at which it was asked for.
+    for i in np.argsort(columns["publish_time"], kind="stable"):
+        set_ = [*columns["new_parameters"][i], *columns["changed_parameters"][i]]
+        changes = {parameter["name"]: _value(parameter["value"]) for parameter in set_}
+        events.setdefault(str(columns["node"][i]), []).append((int(columns["publish_time"][i]), changes))
+    return {node: ParameterHistory(node, tuple(changes)) for node, changes in events.items()}
+
+
+def gains_by_digest(histories: Mapping[str, ParameterHistory]) -> dict[str, tuple[Gains, int]]:
+    """Every set of controller parameters that a node had: gains and sample period in ns, by its digest."""
+    found: dict[str, tuple[Gains, int]] = {}
+    for history in histories.values():
+        for _, values in history.sets():
+            if "anti_windup" not in values or "sample_period" not in values:
+                continue
+            try:
+                gains, period_ns = gains_from_mapping(values), sample_period_in_ns(values["sample_period"])
+            except ValueError:
+                continue  # the node declares its parameters one by one: not all of them yet
+            found[parameters_digest(gains, period_ns)] = gains, period_ns
+    return found
+
+
+def _value(value: Mapping[str, Any]) -> Any:
+    field = _VALUE_FIELDS.get(int(value["type"]))
+    content = value[field] if field else None
+    return content.tolist() if isinstance(content, np.ndarray) else content

@@ -1,0 +1,168 @@
+"""A loop as a bag holds it: its signals in the order in which they were published, plans and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from tdof_npid_ros.analysis.errors import AnalysisError
+from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.scenario import Plan, PlanError
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+_OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
+_SECOND = 1_000_000_000  # ns
+
+
+@dataclass(frozen=True)
+class Signal:
+    """The messages of one JointState topic.
+
+    Attributes:
+        stamp_ns: of the headers, (messages,).
+        frame_id: of the headers, (messages,).
+        publish_ns: when they were published, ns since the epoch, (messages,).
+        sequence: the publisher's count of its messages, (messages,); 0 where the bag does not tell.
+        position, effort: (messages, lanes), or (messages,) of arrays where the number of lanes changes.
+    """
+
+    stamp_ns: np.ndarray
+    frame_id: np.ndarray
+    publish_ns: np.ndarray
+    sequence: np.ndarray
+    position: np.ndarray
+    effort: np.ndarray
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.stamp_ns)
+
+    def runs(self) -> list[slice]:
+        """Stretches of messages with the same `frame_id`."""
+        if not len(self):
+            return []
+        starts = [0, *(np.flatnonzero(self.frame_id[1:] != self.frame_id[:-1]) + 1).tolist(), len(self)]
+        return [slice(a, b) for a, b in zip(starts, starts[1:], strict=False)]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One closed loop in a bag, or a robot's joint states alone.
+
+    Attributes:
+        bag: its path, for messages.
+        namespace: ends with a slash.
+        output: what is controlled; `effort` the effort really applied.
+        control_effort: the controller's answers; None in a bag without.
+        disturbance, setpoint: as published live; None in a bag without.
+        plans: by digest.
+        histories: the parameters of every node in the bag, by its full name.
+    """
+
+    bag: str
+    namespace: str
+    output: Signal
+    control_effort: Signal | None
+    setpoint: Signal | None
+    disturbance: Signal | None
+    plans: Mapping[str, Plan]
+    histories: Mapping[str, ParameterHistory]
+
+    @cached_property
+    def plant(self) -> ParameterHistory | None:
+        """The parameters of the node that simulates the plant."""
+        return self._node_with("model", "time_constant", "lanes")
+
+    @cached_property
+    def scenario(self) -> ParameterHistory | None:
+        """The parameters of the scenario."""
+        return self._node_with("episodes")
+
+    def _node_with(self, required: str, *others: str) -> ParameterHistory | None:
+        for node, history in self.histories.items():
+            names = {name for _, changes in history.events for name in changes}
+            if node.rpartition("/")[0] + "/" == self.namespace and required in names:
+                if not others or any(name in names for name in others):
+                    return history
+        return None
+
+
+def read_loops(reader: BagReader, bag: str) -> list[Loop]:
+    """The loops in a bag: each namespace's `output`, or else any `joint_states`, or else any other JointState.
+
+    Raises:
+        AnalysisError: no topic can be an output.
+        BagError: the bag is damaged.
+    """
+    histories = read_histories(reader)
+    return [
+        Loop(
+            bag,
+            namespace,
+            _signal(reader, topic),
+            _signal_if_there(reader, f"{namespace}control_effort"),
+            _signal_if_there(reader, f"{namespace}setpoint"),
+            _signal_if_there(reader, f"{namespace}disturbance"),
+            _plans(reader, f"{namespace}scenario_plan"),
+            histories,
+        )
+        for topic in _output_topics(reader, bag)
+        for namespace in [topic.rpartition("/")[0] + "/"]
+    ]
+
+
+def _output_topics(reader: BagReader, bag: str) -> list[str]:
+    signals = [name for name, info in sorted(reader.topics.items()) if info.type == JOINT_STATE and info.count]
+    for wanted in ("output", "joint_states"):
+        found = [name for name in signals if name.rpartition("/")[2] == wanted]
+        if found:
+            return found
+    others = [name for name in signals if name.rpartition("/")[2] not in _OTHER_SIGNALS]
+    if not others:
+        raise AnalysisError(
+            f"{bag}: no output in it, that is no topic of type {JOINT_STATE} but "
+            f"{', '.join(_OTHER_SIGNALS)}: its topics are {', '.join(sorted(reader.topics)) or 'none'}"
+        )
+    return others
+
+
+def _signal_if_there(reader: BagReader, topic: str) -> Signal | None:
+    there = topic in reader.topics and reader.topics[topic].type == JOINT_STATE
+    return _signal(reader, topic) if there else None
+
+
+def _signal(reader: BagReader, topic: str) -> Signal:
+    columns = reader.columns(topic, ["header.stamp", "header.frame_id", "position", "effort"])
+    return Signal(
+        columns["header.stamp"],
+        columns["header.frame_id"],
+        columns["publish_time"],
+        columns["sequence"],
+        columns["position"],
+        columns["effort"],
+    )
+
+
+def _plans(reader: BagReader, topic: str) -> dict[str, Plan]:
+    """The valid plans on a topic by digest; a message that is no plan is one that every node refused."""
+    plans: dict[str, Plan] = {}
+    if topic not in reader.topics or reader.topics[topic].type != JOINT_TRAJECTORY:
+        return plans
+    for _, _, _, data in reader.messages([topic]):
+        message = reader.decode(topic, data)
+        times = [point["time_from_start"] for point in message["points"]]
+        try:
+            plan = Plan(
+                tuple(message["joint_names"]),
+                tuple(time["sec"] * _SECOND + time["nanosec"] for time in times),
+                tuple(tuple(point["positions"].tolist()) for point in message["points"]),
+            )
+        except PlanError:
+            continue
+        plans[plan.digest] = plan
+    return plans

@@ -1,0 +1,97 @@
+"""`tdof-npid demo`: the paper's first process over ROS 2, end to end."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from tdof_npid_ros.case import Case, find_parameter_file, load_case
+from tdof_npid_ros.cli.gains import gains_by_source
+from tdof_npid_ros.control.gains import PER_LANE
+from tdof_npid_ros.paper.tables import COMPARED, published
+
+CASE = "p1-c0.5"
+NAMESPACE = "/demo"
+START_TIMEOUT = 60.0  # s; the first start compiles
+PLAY_TIMEOUT = 120.0  # s
+SUBSCRIBERS = {"output": 2, "control_effort": 2, "controller_state": 1, "scenario_plan": 3}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument("--bag", type=Path, help="folder of the bag (default: bags/demo-<time>)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    from tdof_npid_ros.analysis.report import analyze
+    from tdof_npid_ros.graph.conductor import Conductor
+    from tdof_npid_ros.graph.processes import NodeProcesses
+
+    case = load_case(CASE)
+    bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
+    if bag.exists():
+        raise FileExistsError(f"{bag} exists already and is not overwritten: choose another --bag")
+    with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as nodes:
+        nodes.start("recorder", {"bag": bag})
+        for node in ("plant", "controller"):
+            nodes.start(node)
+        nodes.start("scenario", {"play": False})
+        conductor = Conductor(NAMESPACE, nodes.check)
+        try:
+            _say(arguments, f"Starting plant, controller, scenario and recorder in {NAMESPACE} …")
+            conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
+            _play(conductor, case, quiet=arguments.json)
+        finally:
+            conductor.close()
+    report = analyze([bag])
+    picture = bag / "responses.png"
+    report.picture(picture)
+    if arguments.json:
+        print(json.dumps({"bag": str(bag), "picture": str(picture), "episodes": report.as_dict()["episodes"]}))
+    else:
+        print(_comparison(report))
+        print(f"bag      {bag}\npicture  {picture}")
+        print(f"Next: tdof-npid verify {bag}; tdof-npid analyze {bag} --html report.html")
+    return 0
+
+
+def _say(arguments: argparse.Namespace, text: str) -> None:
+    if not arguments.json:
+        print(text, flush=True)
+
+
+def _play(conductor: Any, case: Case, quiet: bool) -> None:
+    """Play the case's episodes once for each compared controller, with a progress bar in simulated seconds."""
+    episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
+    with tqdm(total=len(COMPARED) * sum(episode_s), unit=" s", disable=quiet, bar_format=_BAR) as bar:
+        for round_, controller in enumerate(COMPARED):
+            gains = gains_by_source(case, controller, "published")
+            bar.set_description(f"{controller:10}")
+            conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
+            conductor.trigger("scenario/play")
+
+            def played(round_: int = round_) -> bool:
+                done = int(conductor.fact("plant", "episode") or 0) - 1 - round_ * len(episode_s)
+                if 0 <= done < len(episode_s):
+                    position = round_ * sum(episode_s) + sum(episode_s[:done]) + conductor.time_ns / 1e9
+                    bar.update(max(0.0, min(position, bar.total) - bar.n))
+                return conductor.fact("scenario", "played") == str(round_ + 1)
+
+            conductor.wait(played, f"the end of the episodes with {controller}", PLAY_TIMEOUT)
+        bar.update(bar.total - bar.n)
+
+
+_BAR = "{desc} {percentage:3.0f}% |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
+
+
+def _comparison(report: Any) -> str:
+    """The metrics of each episode beside the published ones."""
+    return str(report.table())

@@ -1,0 +1,115 @@
+"""`tdof-npid pareto`: fronts of tracking against rejection (the paper's Figure 6)."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from tdof_npid_ros.case import controller_type
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.paper.output import claim_folder
+from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
+from tdof_npid_ros.tuning.pareto import GENERATIONS, RATIOS, Front, pareto_front
+
+SUBCOMMAND = "pareto"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument(
+        "--ratio", type=float, nargs="+", default=list(RATIOS), metavar="L/T", help="default: 0.1 0.5 1"
+    )
+    parser.add_argument(
+        "--controller", nargs="+", default=list(CONTROLLER_TYPES), metavar="TYPE", help="default: all four"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of NSGA-II (default: 0)")
+    parser.add_argument("--generations", type=int, default=GENERATIONS, help=f"default: {GENERATIONS}")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write fronts.csv, fronts.json and fronts.png there")
+    parser.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="write one point as a ROS parameter file (one --ratio and --controller)",
+    )
+    picked = parser.add_mutually_exclusive_group()
+    picked.add_argument("--index", type=int, help="of the point to write, by increasing IAE_SP")
+    picked.add_argument(
+        "--weight",
+        type=float,
+        default=1.0,
+        metavar="W",
+        help="write the point with the least IAE_SP + W·IAE_DIS (default: 1)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find the fronts, print them, and write what was asked for."""
+    controllers = [controller_type(name) for name in dict.fromkeys(arguments.controller)]
+    ratios = list(dict.fromkeys(arguments.ratio))
+    if arguments.write:
+        _refuse_unwritable(arguments.write, len(controllers) * len(ratios))
+    if arguments.out:
+        claim_folder(arguments.out, SUBCOMMAND)
+    fronts = []
+    searches = [(ratio, controller) for ratio in ratios for controller in controllers]
+    with tqdm(total=len(searches) * arguments.generations, unit="generation", leave=False) as bar:
+        for ratio, controller in searches:
+            bar.set_description(f"L/T = {ratio:g}, {controller}")
+            fronts.append(
+                pareto_front(
+                    ratio,
+                    controller,
+                    seed=arguments.seed,
+                    generations=arguments.generations,
+                    after_generation=bar.update,
+                )
+            )
+    rows = [row for front in fronts for row in front.rows()]
+    if arguments.out:
+        _write(fronts, rows, arguments.out)
+    if arguments.write:
+        index = fronts[0].best(arguments.weight) if arguments.index is None else arguments.index
+        write_parameters(arguments.write, fronts[0].parameters(index))
+    print(json.dumps({"seed": arguments.seed, "points": rows}) if arguments.json else _table(fronts))
+    return 0
+
+
+def _refuse_unwritable(path: Path, fronts: int) -> None:
+    if fronts != 1:
+        raise ParameterFileError(
+            f"--write takes a point of one front, but there are {fronts}: give one --ratio and --controller"
+        )
+    if path.exists():
+        raise ParameterFileError(f"{path} exists: give another file")
+    if not path.parent.is_dir():
+        raise ParameterFileError(f"{path} cannot be written: there is no folder {path.parent}")
+
+
+def _write(fronts: list[Front], rows: list[dict[str, Any]], folder: Path) -> None:
+    from tdof_npid_ros.paper.figures import draw_fronts
+
+    with (folder / "fronts.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    (folder / "fronts.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    draw_fronts(fronts, folder / "fronts.png")
+
+
+def _table(fronts: list[Front]) -> str:
+    lines = [f"{'L/T':>6} {'controller':12}{'points':>8}{'IAE_SP':>18}{'IAE_DIS':>20}{'least sum':>12}"]
+    for front in fronts:
+        lines.append(
+            f"{front.ratio:6g} {front.controller:12}{len(front.gains):8d}"
+            + "".join(
+                f"{low:12.4f} .. {high:.4f}"
+                for low, high in zip(front.iae.min(axis=0), front.iae.max(axis=0), strict=True)
+            )
+            + f"{front.iae[front.best()].sum():12.4f}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,81 @@
+"""The loop's nodes as processes of this program, stopped whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
+
+
+class NodeProcessError(RuntimeError):
+    """A node that could not be started or has ended; the message shows the end of its log."""
+
+
+class NodeProcesses:
+    """Starts nodes and stops all of them on leaving the context.
+
+    Args:
+        parameter_file: given to every node.
+        namespace: in which they run.
+    """
+
+    def __init__(self, parameter_file: Path, namespace: str = "/") -> None:
+        self._parameter_file = parameter_file
+        self._namespace = namespace
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._logs = Path(tempfile.mkdtemp(prefix="tdof-npid-"))
+
+    def start(self, node: str, parameters: Mapping[str, Any] | None = None) -> None:
+        """Start a node, its log in a temporary file."""
+        command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "-r", f"__ns:={self._namespace}"]
+        command += ["--params-file", str(self._parameter_file)]
+        for name, value in (parameters or {}).items():
+            command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+        with self.log(node).open("wb") as log:
+            # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
+            self._processes[node] = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    def log(self, node: str) -> Path:
+        """Where a node's log is."""
+        return self._logs / f"{node}.log"
+
+    def check(self) -> None:
+        """Make sure that all nodes run.
+
+        Raises:
+            NodeProcessError: one has ended.
+        """
+        for node, process in self._processes.items():
+            if process.poll() is not None:
+                tail = " | ".join(self.log(node).read_text(errors="replace").strip().splitlines()[-5:])
+                raise NodeProcessError(f"the node {node} ended with status {process.returncode}: {tail}")
+
+    def stop(self) -> None:
+        """Interrupt every node, the last started first, and wait for it; kill what does not end."""
+        for process in reversed(self._processes.values()):
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in self._processes.values():
+            try:
+                process.wait(STOP_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+    def __enter__(self) -> NodeProcesses:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()

@@ -1,0 +1,265 @@
+"""The paper, reproduced: its tables and figures beside ours, and one page about it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE
+from tdof_npid_ros.paper.conclusions import (
+    against_pid,
+    against_published,
+    at_a_glance,
+    at_least_as_good,
+    beats_pid,
+    front_claims,
+    front_statements,
+    reproduced,
+)
+from tdof_npid_ros.paper.evaluation import CASE_TITLES, CONTROLLER_TITLES, Measured, Rows, evaluate_row
+from tdof_npid_ros.paper.findings import findings
+from tdof_npid_ros.paper.items import ITEMS, Evaluated
+from tdof_npid_ros.paper.output import OutputError, claim_folder
+from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
+from tdof_npid_ros.paper.report import Figure, Finding, Table
+from tdof_npid_ros.paper.tables import COMPARED, ROWS
+from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
+from tdof_npid_ros.tuning.pareto import RATIOS, Front, pareto_front
+from tdof_npid_ros.tuning.problem import GENERATIONS
+
+TITLE = "Design of novel TDOF nonlinear PID controllers, reproduced"
+SUBCOMMAND = "reproduce"
+SECTIONS = {  # of the page: the paper's own
+    "The controllers": ("figure1", "figure6"),
+    "Process 1: first order plus dead time": ("table1", "table2", "figure7", "figure8"),
+    "Process 2: second order plus dead time": ("table3", "table4", "figure9", "figure10"),
+    "Process 3: third order with a positive zero": ("table5", "table6", "figure11", "figure12"),
+    "Sprott circuit": (
+        "figure13",
+        "table7",
+        "table8",
+        "figure14",
+        "table9",
+        "figure15",
+        "figure16",
+    ),
+}
+CONVENTIONS = """\
+- Controllers: the paper's equations (1) to (8), N = 10, σ = 1, sampled; plants discretised exactly, exact dead time.
+- 'Published': as printed. 'Ours at the published gains': the printed gains in our loop. 'Ours, tuned': the gains that our \
+hybrid genetic algorithm (HGA) finds for the same objective IAE_SP + IAE_DIS, knowing nothing of the printed ones.
+- M_p: overshoot in per cent of the step. t_s: time to within 5 % of the step. M_peak: largest deviation under the \
+disturbance. t_rcy: time to within 2 % of the setpoint step. IAE: integral of the absolute error.
+- Deviations are relative to the published value; colours: up to 4 %, up to 10 %, beyond.
+- One set of conventions for all rows; nothing is adjusted where a row does not come out."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is spent on tuning.
+
+    Attributes:
+        seeds: HGA runs per row; the best counts, the worst is told.
+        generations: of each HGA run.
+        pareto_generations: of each NSGA-II run.
+    """
+
+    seeds: int = 1
+    generations: int = GENERATIONS
+    pareto_generations: int = PARETO_GENERATIONS
+
+
+class Reproduction:
+    """The chosen tables and figures, and what they need to be computed.
+
+    Raises:
+        OutputError: an unknown table or figure, or no seed.
+    """
+
+    def __init__(self, only: Sequence[str] = (), effort: Effort | None = None) -> None:
+        """
+        Args:
+            only: names out of `ITEMS`; none: all of them.
+        """
+        unknown = [name for name in only if name not in ITEMS]
+        if unknown:
+            raise OutputError(f"the paper has no {unknown[0]!r} to reproduce: take any of {', '.join(ITEMS)}")
+        self.effort = effort or Effort()
+        if self.effort.seeds < 1:
+            raise OutputError(f"{self.effort.seeds} seeds: at least 1")
+        self.names = tuple(name for name in ITEMS if not only or name in only)
+        self.rows: Rows = {}
+        self.fronts: list[Front] = []
+        self.built: dict[str, Table | Figure] = {}
+        self.findings: tuple[Finding, ...] = ()
+
+    def jobs(self, folder: Path) -> list[tuple[str, Callable[[], None]]]:
+        """What is to be done, in order: each a label and a function.
+
+        Args:
+            folder: where the files go; it is claimed by the first job.
+        """
+        cases = {case for name in self.names for case in ITEMS[name].cases}
+        fronts = any(ITEMS[name].needs_fronts for name in self.names)
+        return [
+            *(self._row_job(index) for index, row in enumerate(ROWS) if row.case in cases),
+            *(self._front_job(ratio, kind) for ratio in RATIOS for kind in range(len(CONTROLLER_TYPES)) if fronts),
+            ("evidence", self._find),
+            *((name, lambda name=name: self._build(name, folder)) for name in self.names),
+            ("page", lambda: self._write_page(folder)),
+        ]
+
+    def summary(self, folder: Path) -> dict[str, Any]:
+        """The outcome as one JSON object."""
+        return {
+            "directory": str(folder),
+            "page": str(folder / "index.html"),
+            "items": list(self.names),
+            "rows": [
+                {
+                    "case": case,
+                    "controller": controller,
+                    "published": {**row.published._asdict(), "objective": row.published.objective},
+                    "at_published_gains": row.at_published.values,
+                    "tuned": _measured(row.tuned),
+                    "tuned_sigma_too": _measured(row.sigma_free) if row.sigma_free else None,
+                    "objectives_by_seed": list(row.objectives),
+                    "reproduced": reproduced(row),
+                    "at_or_below_published": at_least_as_good(row),
+                }
+                for (case, controller), row in self.rows.items()
+            ],
+            "conclusions": [
+                {
+                    "case": case,
+                    "controller": controller,
+                    **dict(
+                        zip(("lower_overshoot", "lower_objective"), beats_pid(self.rows, case, controller), strict=True)
+                    ),
+                }
+                for case in self._cases
+                for controller in COMPARED[1:]
+            ],
+        }
+
+    @property
+    def _cases(self) -> list[str]:
+        return list(dict.fromkeys(case for case, _ in self.rows))
+
+    def _row_job(self, index: int) -> tuple[str, Callable[[], None]]:
+        published = ROWS[index]
+
+        def evaluate() -> None:
+            row = evaluate_row(published, self.effort.seeds, self.effort.generations)
+            self.rows[published.case, published.controller] = row
+
+        return f"HGA: {CASE_TITLES[published.case]}, {CONTROLLER_TITLES[published.controller]}", evaluate
+
+    def _front_job(self, ratio: float, kind: int) -> tuple[str, Callable[[], None]]:
+        controller = CONTROLLER_TYPES[kind]
+
+        def search() -> None:
+            self.fronts.append(pareto_front(ratio, controller, generations=self.effort.pareto_generations))
+
+        return f"NSGA-II: L/T = {ratio:g}, {CONTROLLER_TITLES[controller]}", search
+
+    def _find(self) -> None:
+        self.findings = findings(self.rows) if self.rows else ()
+
+    def _build(self, name: str, folder: Path) -> None:
+        built = self.built[name] = ITEMS[name].build(Evaluated(self.rows, tuple(self.fronts)))
+        if isinstance(built, Figure):
+            built.draw(folder / f"{name}.png")
+            (folder / f"{name}.csv").write_text(built.csv(), encoding="utf-8")
+        else:
+            _write_table(built, folder)
+
+    def _write_page(self, folder: Path) -> None:
+        sections = list(self._sections())
+        for section in sections:
+            for block in section.blocks:
+                table = block.table if isinstance(block, Finding) else block
+                if isinstance(table, Table):
+                    _write_table(table, folder)
+        (folder / "index.md").write_text(markdown_page(TITLE, sections), encoding="utf-8")
+        (folder / "index.html").write_text(html_page(TITLE, sections, folder), encoding="utf-8")
+        text = json.dumps(self.summary(folder), indent=1)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+
+    def _sections(self) -> Iterator[Section]:
+        yield Section("In short", ("\n".join(f"- {sentence}" for sentence in self._in_short()), CONVENTIONS))
+        if self.rows:
+            yield Section("What reproduces", (at_a_glance(self.rows),))
+            yield Section(
+                "The paper's conclusions on our numbers", (against_pid(self.rows), against_published(self.rows))
+            )
+            yield Section("What does not reproduce, and why", self.findings)
+        for title, names in SECTIONS.items():
+            blocks = [self.built[name] for name in names if name in self.built]
+            if blocks:
+                claims = (front_claims(self.fronts),) if "figure6" in self.built and "figure6" in names else ()
+                yield Section(title, (*blocks, *claims))
+
+    def _in_short(self) -> Iterator[str]:
+        rows = self.rows.values()
+        if rows:
+            yield (
+                f"{sum(map(reproduced, rows))} of {len(rows)} published rows come out at the published gains "
+                "(within 2 points of M_p, 4 % of both IAE, 3 % of M_peak); the others are explained as far as we can."
+            )
+            good = [at_least_as_good(row) for row in rows]
+            yield (
+                f"Our HGA is at or below the published optimum in {good.count('yes')} of {len(good)} rows"
+                + (f", with σ tuned too in {good.count('with σ tuned')} more" if "with σ tuned" in good else "")
+                + (f"; NOT in {good.count('NO')}." if "NO" in good else ".")
+            )
+            pairs = [(case, controller) for case in self._cases for controller in COMPARED[1:]]
+            lost = [pair for pair in pairs if not all(beats_pid(self.rows, *pair))]
+            yield (
+                f"Tuned by our HGA, the TDOF-NPID controllers beat PID both in M_p and in the objective in "
+                f"{len(pairs) - len(lost)} of {len(pairs)} comparisons"
+                + (
+                    "; not so: " + ", ".join(f"{CONTROLLER_TITLES[k]} on {CASE_TITLES[c]}" for c, k in lost)
+                    if lost
+                    else ""
+                )
+                + "."
+            )
+        if self.fronts:
+            yield from front_statements(self.fronts)
+        if self.findings:
+            yield (
+                "Puzzles, each with its evidence below: " + "; ".join(finding.title for finding in self.findings) + "."
+            )
+        if len(self.names) < len(ITEMS):
+            yield "This run holds only " + ", ".join(self.names) + "."
+
+
+def reproduce(folder: Path, reproduction: Reproduction, before_job: Progress = lambda _: None) -> dict[str, Any]:
+    """Compute and write everything; returns the summary.
+
+    Args:
+        before_job: called with each job's label, for a progress bar.
+
+    Raises:
+        OutputError: the folder holds other files, or cannot be written.
+    """
+    claim_folder(folder, SUBCOMMAND)
+    for label, job in reproduction.jobs(folder):
+        before_job(label)
+        job()
+    return reproduction.summary(folder)
+
+
+def _write_table(table: Table, folder: Path) -> None:
+    (folder / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")
+    (folder / f"{table.name}.md").write_text(markdown_table(table) + "\n", encoding="utf-8")
+
+
+def _measured(measured: Measured) -> dict[str, Any]:
+    return {"gains": {name: getattr(measured.gains, name) for name in PER_LANE}, **measured.values}

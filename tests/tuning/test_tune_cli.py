@@ -1,0 +1,184 @@
+"""`tdof-npid tune`: what it prints and writes, and what it refuses before it has cost anything."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tdof_npid_ros.case import config_folder, load_case
+from tdof_npid_ros.cli import main
+from tdof_npid_ros.tuning.study import tune_case
+
+QUICK = ["p3-c1", "--population", "10", "--generations", "5", "--seed", "2"]
+TUNE = [sys.executable, "-m", "tdof_npid_ros", "tune"]
+
+
+def tuned(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main(["tune", *QUICK, "--json", *arguments]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    report: dict[str, Any] = json.loads(captured.out)
+    return report
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr."""
+    assert main(["tune", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("tdof-npid tune: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_it_prints_what_simulate_prints_for_the_optimum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = tuned(capsys, "--controller", "tdof_npid1", "--out", str(tmp_path / "gains.yaml"))
+    assert main(["simulate", "p3-c1", "--controller", "tdof_npid1", "--gains", str(tmp_path / "gains.yaml"), "--json"]) == 0
+    simulated = json.loads(capsys.readouterr().out)
+    assert report.pop("evaluations") == 50
+    assert report.pop("elapsed_s") > 0
+    assert report == simulated
+
+
+def test_the_objective_printed_is_the_one_that_the_search_minimised(capsys: pytest.CaptureFixture[str]) -> None:
+    result = tune_case(load_case("p3-c1"), "tdof_npid1", seed=2, population=10, generations=5)
+    assert tuned(capsys, "--controller", "tdof_npid1")["objective"] == result.objective
+
+
+def test_the_weight_counts_in_the_objective(capsys: pytest.CaptureFixture[str]) -> None:
+    report = tuned(capsys, "--controller", "pid", "--weight", "0.25")
+    assert report["objective"] == report["setpoint"]["iae"] + 0.25 * report["disturbance"]["iae"]
+
+
+def test_sigma_moves_only_when_it_is_free(capsys: pytest.CaptureFixture[str]) -> None:
+    assert tuned(capsys, "--controller", "npid")["gains"]["sigma"] == 1.0
+    assert tuned(capsys, "--controller", "npid", "--free", "sigma")["gains"]["sigma"] != 1.0
+
+
+@pytest.mark.parametrize("algorithm", ["hga", "de", "cmaes"])
+def test_every_algorithm_spends_the_budget_and_repeats_itself(
+    algorithm: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, again = (tuned(capsys, "--controller", "pid", "--algorithm", algorithm) for _ in range(2))
+    assert first["evaluations"] == 50
+    assert first["gains"] == again["gains"]
+
+
+def test_the_parameter_file_is_one_for_the_controller_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "gains.yaml"
+    gains = tuned(capsys, "--controller", "tdof_npid2", "--out", str(out))["gains"]
+    parameters = yaml.safe_load(out.read_text())["/**/controller"]["ros__parameters"]
+    assert parameters["type"] == "tdof_npid2"
+    assert {name: parameters[name] for name in gains} == gains
+    assert all(isinstance(value, float) for name, value in parameters.items() if name not in ("type", "anti_windup"))
+
+
+def test_ros_reads_the_parameter_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parameter = pytest.importorskip("rclpy.parameter")
+    out = tmp_path / "gains.yaml"
+    gains = tuned(capsys, "--controller", "tdof_npid2", "--out", str(out))["gains"]
+    for use_wildcard in (True, False):  # as `ros2 param load` reads it, with and without --no-use-wildcard
+        read = parameter.parameter_dict_from_yaml_file(str(out), use_wildcard)
+        assert {name: read[name].value.double_value for name in gains} == gains
+
+
+def test_the_convergence_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tuned(capsys, "--controller", "pid", "--plot", str(tmp_path / "convergence"))
+    assert (tmp_path / "convergence").read_bytes().startswith(b"\x89PNG")
+
+
+def test_people_see_the_progress_and_the_optimum(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tune", *QUICK, "--controller", "pid"]) == 0
+    captured = capsys.readouterr()
+    assert "50 evaluations" in captured.out
+    for shown in ("generation", "best", "evaluations/s"):
+        assert shown in captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["p9", "--controller", "pid"], "no case 'p9'"),
+        (["p3-c1", "--controller", "fuzzy"], "no controller type 'fuzzy'"),
+        (["p3-c1", "--controller", "pid", "--algorithm", "luck"], "algorithm 'luck' is unknown"),
+        (["p3-c1", "--controller", "pid", "--free", "sigma"], "sigma cannot be freed for pid"),
+        (["p3-c1", "--controller", "pid", "--weight", "-1"], "weight is -1.0"),
+        (["p3-c1", "--controller", "pid", "--seed", "-1"], "seed -1"),
+        (["p3-c1", "--controller", "pid", "--population", "0"], "population 0"),
+        (["p3-c1", "--controller", "pid", "--generations", "0"], "generations 0"),
+        (["p3-c1", "--controller", "pid", "--budget", "39"], "budget of 39"),
+        (["p3-c1", "--controller", "pid", "--resume"], "--resume needs --checkpoint"),
+        (["p3-c1", "--controller", "pid", "--out", "/nowhere/x"], "/nowhere/x cannot be written"),
+        (["p3-c1", "--controller", "pid", "--plot", "/"], "/ cannot be written"),
+        (["p3-c1", "--controller", "pid", "--checkpoint", "/proc/x"], "/proc/x cannot be written"),
+        (["p3-c1", "--controller", "pid", "--out", "a", "--plot", "a"], "must be different files"),
+        (["p3-c1", "--controller", "pid", "--out", str(config_folder() / "p3-c1.yaml")], "must be different files"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(
+    arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert told in refused(capsys, *arguments)
+
+
+def test_reversed_bounds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (config_folder() / "p3-c1.yaml").read_text()
+    case = tmp_path / "mine.yaml"
+    case.write_text(text.replace("ki: [0.0, 3.0]", "ki: [3.0, 0.0]"))
+    assert "bounds.ki is [3.0, 0.0]" in refused(capsys, str(case), "--controller", "pid")
+
+
+def test_nothing_is_written_when_anything_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "gains.yaml").write_text("mine")
+    (tmp_path / "checkpoint").write_text("mine too")
+    outputs = ["--out", str(tmp_path / "gains.yaml"), "--plot", str(tmp_path / "plot.png")]
+    checkpoint = ["--checkpoint", str(tmp_path / "checkpoint")]
+    refused(capsys, *QUICK, "--controller", "pid", *outputs, *checkpoint)
+    refused(capsys, *QUICK, "--controller", "pid", *outputs, *checkpoint, "--resume")
+    refused(capsys, *QUICK, "--controller", "fuzzy", *outputs)
+    assert sorted(os.listdir(tmp_path)) == ["checkpoint", "gains.yaml"]
+    assert (tmp_path / "gains.yaml").read_text() == "mine"
+    assert (tmp_path / "checkpoint").read_text() == "mine too"
+
+
+def test_resume_without_a_checkpoint_yet_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = ["--checkpoint", str(tmp_path / "c")]
+    began = tuned(capsys, "--controller", "pid", *checkpoint, "--resume")
+    finished = tuned(capsys, "--controller", "pid", *checkpoint, "--resume")
+    assert began["gains"] == finished["gains"]
+
+
+def test_ctrl_c_ends_with_the_generation_and_the_run_can_be_resumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint, out = tmp_path / "c", tmp_path / "gains.yaml"
+    arguments = ["p3-c1", "--controller", "pid", "--generations", "100", "--json", "--checkpoint", str(checkpoint)]
+    child = subprocess.Popen([*TUNE, *arguments, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    started = time.monotonic()
+    while not (checkpoint.exists() and '"generation": 3' in checkpoint.read_text()):
+        assert child.poll() is None
+        assert time.monotonic() - started < 60
+        time.sleep(0.005)
+    child.send_signal(signal.SIGINT)
+    output, errors = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert output == b""
+    assert not out.exists()
+    assert errors.decode().count("\n") == 1
+    assert "go on with --resume" in errors.decode()
+
+    assert main(["tune", *arguments, "--resume"]) == 0
+    resumed = json.loads(capsys.readouterr().out)
+    assert main(["tune", *arguments[:-2]]) == 0
+    uninterrupted = json.loads(capsys.readouterr().out)
+    assert resumed.pop("elapsed_s") > 0 < uninterrupted.pop("elapsed_s")
+    assert resumed == uninterrupted
