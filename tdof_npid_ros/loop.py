@@ -19,16 +19,17 @@ from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
 from tdof_npid_ros.plants.kernels import plant_input, plant_output
-from tdof_npid_ros.plants.lanes import advance_sound, applied
+from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.states import loaded, store
 from tdof_npid_ros.scenario import Signals
 
 VECTOR = 8  # lanes: block widths are multiples of it, and at least two of it
 LARGEST_BLOCK = 64  # lanes
+SOUND_OUTPUT = 1e12  # |y| from which on a lane counts as diverged; seen in the outputs alone, so the live tuner sees it
 
 # A lane's rows: its coefficients, then these, then the plant's state.
-(_U_I, _Z, _ERROR_SUM, _SOUND_STEPS, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
+(_U_I, _Z, _ERROR_SUM, _SOUND, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
 
 PlantAt = Callable[[dict[str, float]], Plant]  # the plant for a set of changed parameters
 
@@ -57,7 +58,7 @@ class Integrals:
 
     Attributes:
         iae: integral of the absolute error (9), trapezoidal rule, (lanes,).
-        sound_share: share of the steps before the lane diverged, (lanes,); 1 for a lane that did not.
+        sound_share: share of the outputs below SOUND_OUTPUT, (lanes,); 1 for a lane that did not diverge.
     """
 
     iae: np.ndarray
@@ -100,10 +101,10 @@ def _run(
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
         lane_rows = _run_block_of(plant_at, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
-        iae[block], sound[block] = lane_rows[_ERROR_SUM : _SOUND_STEPS + 1, : block.stop - block.start]
+        iae[block], sound[block] = lane_rows[_ERROR_SUM : _SOUND + 1, : block.stop - block.start]
         if len(output):
             output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
-    return Integrals(iae * (signals.sample_period_ns / 1e9), np.minimum(sound, steps) / steps)
+    return Integrals(iae * (signals.sample_period_ns / 1e9), sound / (steps + 1))
 
 
 def _width(lanes: int) -> int:
@@ -155,8 +156,8 @@ def closed_step(
     y = plant_output(plant, x)
     u, u_i, z, _, _, _, _ = law(c, gain_limits, r, y, u_i, z)
     v = plant_input(plant, applied(u, limits), d)
-    x, sound = advance_sound(plant, x, v_old, v if plant.delay == 0 else v_due, d)
-    return y, u, v, x, u_i, z, sound
+    x = advance_bounded(plant, x, v_old, v if plant.delay == 0 else v_due, d)
+    return y, u, v, x, u_i, z
 
 
 @entry_point
@@ -180,22 +181,22 @@ def _run_lane(
     new = np.uint64(first) % size
     c = lane_coefficients(rows, 0, 1)
     x = loaded(x, rows, _X, 1)
-    u_i, z, error_sum, sound_steps = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND_STEPS]
+    u_i, z, error_sum, sound_outputs = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND]
     for k in range(first, last):
         r = setpoint[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        y, u, ring[new], x, u_i, z, sound = closed_step(
+        y, u, ring[new], x, u_i, z = closed_step(
             plant, x, u_i, z, c, gain_limits, limits, r, disturbance[k], ring[oldest], ring[due]
         )
         error_sum += (0.5 if k == 0 or k == end else 1.0) * abs(r - y)
-        sound_steps += 1.0 if sound else 0.0
+        sound_outputs += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
         if y_out.shape[0]:
             y_out[k] = y
             u_out[k] = u
         new = oldest
     store(x, rows, _X, 1)
-    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND_STEPS] = u_i, z, error_sum, sound_steps
+    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND] = u_i, z, error_sum, sound_outputs
 
 
 @entry_point
@@ -235,13 +236,13 @@ def _run_block(
         for j in range(w):
             x = loaded(x, rows, _X * w + j, w)
             c = lane_coefficients(rows, j, w)
-            y, u, rows[_V * w + j], x, rows[_U_I * w + j], rows[_Z * w + j], sound = closed_step(
+            y, u, rows[_V * w + j], x, rows[_U_I * w + j], rows[_Z * w + j] = closed_step(
                 plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, gain_limits, limits, r, d,
                 rows[_V_OLD * w + j], rows[_V_DUE * w + j],
             )  # fmt: skip
             store(x, rows, _X * w + j, w)
             rows[_ERROR_SUM * w + j] += weight * abs(r - y)
-            rows[_SOUND_STEPS * w + j] += 1.0 if sound else 0.0
+            rows[_SOUND * w + j] += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
             rows[_Y * w + j] = y
             rows[_U * w + j] = u
         for j in range(w):

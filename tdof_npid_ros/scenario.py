@@ -171,13 +171,13 @@ def parse_plan(lines: Sequence[str], sample_period_ns: int, plant_parameters: Co
         PlanError: with the line that is wrong.
     """
     entries = [_parse_line(i, str(line), plant_parameters) for i, line in enumerate(lines)]
+    for before, entry in zip(entries, entries[1:], strict=False):
+        if before.signal == "end":
+            raise PlanError(f"{entry.where}: it comes after the end")
+        if entry.time_ns < before.time_ns:
+            raise PlanError(f"{entry.where}: its time is before the line above")
     if not entries or entries[-1].signal != "end":
         raise PlanError("a plan ends with the line 'TIME end'")
-    for i, entry in enumerate(entries):
-        if i and entry.time_ns < entries[i - 1].time_ns:
-            raise PlanError(f"{entry.where}: its time is before the line above")
-        if entry.signal == "end" and i + 1 < len(entries):
-            raise PlanError(f"{entries[i + 1].where}: it comes after the end")
     names = list(dict.fromkeys(entry.signal for entry in entries[:-1])) or ["setpoint"]
     return _unroll(entries, names, sample_period_ns)
 

@@ -10,12 +10,14 @@ import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
+from tdof_npid_ros.bag.columns import SEQUENCE
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.scenario import Plan, PlanError
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 _OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
+_FIELDS = ("header.stamp", "header.frame_id", "position", "effort")
 _SECOND = 1_000_000_000  # ns
 
 
@@ -76,19 +78,19 @@ class Loop:
     @cached_property
     def plant(self) -> ParameterHistory | None:
         """The parameters of the node that simulates the plant."""
-        return self._node_with("model", "time_constant", "lanes")
+        return self._node_with("model", "lanes")
 
     @cached_property
     def scenario(self) -> ParameterHistory | None:
         """The parameters of the scenario."""
         return self._node_with("episodes")
 
-    def _node_with(self, required: str, *others: str) -> ParameterHistory | None:
+    def _node_with(self, *parameters: str) -> ParameterHistory | None:
+        names = set(parameters)
         for node, history in self.histories.items():
-            names = {name for _, changes in history.events for name in changes}
-            if node.rpartition("/")[0] + "/" == self.namespace and required in names:
-                if not others or any(name in names for name in others):
-                    return history
+            its_namespace = node.rpartition("/")[0] + "/"
+            if its_namespace == self.namespace and names <= {name for _, set_ in history.events for name in set_}:
+                return history
         return None
 
 
@@ -137,12 +139,12 @@ def _signal_if_there(reader: BagReader, topic: str) -> Signal | None:
 
 
 def _signal(reader: BagReader, topic: str) -> Signal:
-    columns = reader.columns(topic, ["header.stamp", "header.frame_id", "position", "effort"])
+    columns = reader.columns(topic, [*_FIELDS, SEQUENCE])
     return Signal(
         columns["header.stamp"],
         columns["header.frame_id"],
         columns["publish_time"],
-        columns["sequence"],
+        columns[SEQUENCE],
         columns["position"],
         columns["effort"],
     )

@@ -175,10 +175,26 @@ def decode(type_name: str, definition: str, data: Data) -> dict[str, Any]:
     BagError
         The definition or the message is damaged, or they do not fit each other.
     """
+    message, cursor = _read(type_name, definition, data)
+    cursor.end()
+    return message
+
+
+def without_padding(type_name: str, definition: str, data: Data) -> bytes:
+    """Return a message up to its last field: rclpy's `serialize_message` leaves spare bytes behind it.
+
+    Raises
+    ------
+    BagError
+        As `decode`.
+    """
+    _, cursor = _read(type_name, definition, data)
+    return bytes(data[: cursor.position])
+
+
+def _read(type_name: str, definition: str, data: Data) -> tuple[dict[str, Any], CdrCursor]:
     parsed = parse(type_name, definition)
     cursor = CdrCursor(data, f"message of type {type_name}")
     if parsed.least[parsed.root] > cursor.remaining:
         cursor.skip(parsed.least[parsed.root])  # raises
-    message = _read_message(parsed, parsed.root, cursor)
-    cursor.end()
-    return message
+    return _read_message(parsed, parsed.root, cursor), cursor

@@ -22,6 +22,7 @@ Columns = dict[str, Column]
 
 LOG_TIME: Final = "log_time"
 PUBLISH_TIME: Final = "publish_time"
+SEQUENCE: Final = "publication_sequence"
 
 _LAYOUT_TRIES: Final = 16  # layouts looked for by comparing; a piece with more is sorted message by message
 _ROW_SHIFT: Final = 4  # `scan.gather` puts so many bytes before a message
@@ -235,7 +236,7 @@ class ColumnBuilder:
         BagError
             There is no such field.
         """
-        times = (LOG_TIME, PUBLISH_TIME)
+        times = (LOG_TIME, PUBLISH_TIME, SEQUENCE)
         known = [path for path in definition.paths() if path not in times]
         unknown = [name for name in fields or () if name not in known and name not in times]
         if unknown:
@@ -246,6 +247,7 @@ class ColumnBuilder:
         self._where = where
         self._columns = {path: _Gathered(expected) for path in self._paths}
         self._times: list[tuple[scan.Ints, scan.Ints]] = []
+        self._sequence: list[scan.Ints] | None = [] if SEQUENCE in (fields or ()) else None
         self.count = 0
         self.size = 0  # bytes in the columns so far
 
@@ -261,6 +263,8 @@ class ColumnBuilder:
         self.count += table.length.size
         self._times.append((table.log_time, table.publish_time))
         self.size += 16 * table.length.size
+        if self._sequence is not None:
+            self._sequence.append(table.sequence.astype(np.int64))
         if not self._paths:
             return
         for size in np.unique(table.length):
@@ -284,6 +288,9 @@ class ColumnBuilder:
             log_time, publish_time = log_time[order], publish_time[order]
         columns[LOG_TIME] = log_time
         columns[PUBLISH_TIME] = publish_time
+        if self._sequence is not None:
+            sequence = np.concatenate([empty, *self._sequence])
+            columns[SEQUENCE] = sequence if order is None else sequence[order]
         if not self.count:
             return columns | self._empty()
         for path in self._paths:

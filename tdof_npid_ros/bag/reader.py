@@ -171,6 +171,8 @@ class BagReader:
         fields
             Flattened paths such as "position" or "header.frame_id", by default all. A stamp can be read
             whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", ".nanosec").
+            "publication_sequence", only when asked for: the publisher's count of its messages (int64), 0
+            where the bag does not hold it.
 
         Returns
         -------

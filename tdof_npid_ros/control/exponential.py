@@ -19,7 +19,7 @@ _LARGEST = 700.0  # beyond it exp(-q) is taken as exp(-700) = 1e-304: finite, no
 
 @compiled
 def exp_minus(q: float) -> float:
-    """exp(-q) for q >= 0, within 1 unit in the last place; exactly 1 for q = 0.
+    """exp(-q) for q >= 0, within 2 units in the last place; exactly 1 for q = 0.
 
     2**n * exp(f) with f = -q - n ln 2, |f| <= ln(2)/2, by the Taylor polynomial of degree 13 in Estrin's order.
     """

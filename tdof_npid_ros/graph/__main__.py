@@ -1,4 +1,7 @@
-"""`python -m tdof_npid_ros.graph plant --ros-args …`: a node, where there is no `ros2 run`."""
+"""`python -m tdof_npid_ros.graph NODE [arguments]` runs a node; `ros2 run` calls the functions below.
+
+The node is imported in here, so that Ctrl-C ends it at once and quietly, also while it is still being loaded.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,45 @@ import sys
 NODES = ("plant", "controller", "scenario", "tuner", "recorder", "replay")
 
 
-def main() -> None:
-    """Run the node that the first argument names."""
+def run(node: str, arguments: list[str]) -> None:
+    """Run a node with its command line's arguments, the program's name first."""
+    try:
+        importlib.import_module(f"tdof_npid_ros.graph.{node}_node").main(arguments)
+    except KeyboardInterrupt:
+        sys.exit(0)
+
+
+def plant() -> None:
+    """Run the plant."""
+    run("plant", sys.argv)
+
+
+def controller() -> None:
+    """Run the controller."""
+    run("controller", sys.argv)
+
+
+def scenario() -> None:
+    """Run the scenario."""
+    run("scenario", sys.argv)
+
+
+def tuner() -> None:
+    """Run the tuner."""
+    run("tuner", sys.argv)
+
+
+def recorder() -> None:
+    """Run the recorder."""
+    run("recorder", sys.argv)
+
+
+def replay() -> None:
+    """Run the replay."""
+    run("replay", sys.argv)
+
+
+if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in NODES:
-        sys.exit(f"usage: python -m tdof_npid_ros.graph {'|'.join(NODES)} [--ros-args …]")
-    name = sys.argv.pop(1)
-    importlib.import_module(f"tdof_npid_ros.graph.{name}_node").main()
-
-
-main()
+        sys.exit(f"usage: python -m tdof_npid_ros.graph {{{','.join(NODES)}}} [--ros-args ...]")
+    run(sys.argv[1], sys.argv[1:])

@@ -13,6 +13,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 
+from tdof_npid_ros.bag import schema
+from tdof_npid_ros.bag.cdr import without_padding
 from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.node import OK, LoopNode, run_node
@@ -81,7 +83,9 @@ class RecorderNode(LoopNode):
     def _write_snapshot(self, event: ParameterEvent) -> None:
         if self.writer is not None and "/parameter_events" in self.recorded:
             now = time.time_ns()
-            self.writer.write(self.parameter_events, serialize_message(event), now, now)
+            kind = "rcl_interfaces/msg/ParameterEvent"
+            data = without_padding(kind, schema.definition(kind), serialize_message(event))
+            self.writer.write(self.parameter_events, data, now, now)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         return OK, f"recording {len(self.recorded)} topics to {self.folder}", {"bag": self.folder}

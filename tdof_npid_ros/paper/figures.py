@@ -26,6 +26,7 @@ STYLE: dict[str, dict[str, Any]] = {
 REFERENCE: dict[str, Any] = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
 WIDTH = 10.0  # inches
 DPI = 120
+TITLE_SIZE = 10  # points
 
 
 class Curve(NamedTuple):
@@ -82,7 +83,8 @@ def draw_fronts(fronts: Sequence[Front], path: Path) -> None:
         for front in (front for front in fronts if front.ratio == ratio):
             style = STYLE[front.controller]
             ax.plot(*front.iae.T, linewidth=0.8, markersize=3.0, label=CONTROLLER_TITLES[front.controller], **style)
-        ax.set(title=f"L/T = {ratio:g}", xlabel="IAE_SP (s)", ylabel="IAE_DIS (s)")
+        ax.set(xlabel="IAE_SP (s)", ylabel="IAE_DIS (s)")
+        ax.set_title(f"L/T = {ratio:g}", fontsize=TITLE_SIZE)
     axes[0][-1].legend(frameon=False)
     canvas.savefig(path)
 
@@ -93,10 +95,12 @@ def draw_chaos(time: np.ndarray, x1: np.ndarray, x2: np.ndarray, path: Path) -> 
     portrait, series = axes[0]
     portrait.plot(x1, x2, color="#2f5d8a", linewidth=0.5)
     portrait.plot(x1[0], x2[0], "o", color="#c0392b", markersize=5, label="start")
-    portrait.set(title="(a) phase portrait", xlabel="x₁", ylabel="x₂")
+    portrait.set(xlabel="x₁", ylabel="x₂")
+    portrait.set_title("(a) phase portrait", fontsize=TITLE_SIZE)
     portrait.legend(frameon=False)
     series.plot(time, x1, color="#2f5d8a", linewidth=0.8)
-    series.set(title="(b) output", xlabel="time (s)", ylabel="y = x₁", xlim=(time[0], time[-1]))
+    series.set_title("(b) output", fontsize=TITLE_SIZE)
+    series.set(xlabel="time (s)", ylabel="y = x₁", xlim=(time[0], time[-1]))
     canvas.savefig(path)
 
 
@@ -108,7 +112,8 @@ def _draw_panel(panel: Panel, ax: Axes) -> None:
         style = {name: STYLE[curve.controller][name] for name in ("color", "linestyle")}
         value = curve.value[shown] * panel.scale
         ax.plot(curve.time[shown], value, linewidth=1.4, label=CONTROLLER_TITLES[curve.controller], **style)
-    ax.set(title=panel.title, xlabel="time (s)", ylabel=panel.ylabel, xlim=(panel.curves[0].time[0], panel.until))
+    ax.set_title(panel.title, fontsize=TITLE_SIZE)
+    ax.set(xlabel="time (s)", ylabel=panel.ylabel, xlim=(panel.curves[0].time[0], panel.until))
 
 
 def _canvas(rows: int, columns: int, height: float, width: float = WIDTH) -> tuple[Canvas, list[list[Axes]]]:
@@ -117,5 +122,4 @@ def _canvas(rows: int, columns: int, height: float, width: float = WIDTH) -> tup
     for ax in axes.flat:
         ax.grid(True, color="#e6e6e6", linewidth=0.6)
         ax.spines[["top", "right"]].set_visible(False)
-        ax.title.set_fontsize(10)
     return canvas, axes.tolist()

@@ -189,9 +189,9 @@ def variation_figure(name: str, a: float) -> Item:
         rest = [_from_rest(row, a) for row in rows]
         panels = [
             [
-                Panel("(a) published gains; a changes at 5 s", "y", whole, 10.0, 1.0),
-                Panel("(b) our tuned gains; a changes at 5 s", "y", tuned, 10.0, 1.0),
-                Panel("(c) its effect alone, published gains", "(y - 1)·10³", rest, 15.0, 0.0, 1e3),
+                Panel("(a) published gains", "y", whole, 10.0, 1.0),
+                Panel("(b) our tuned gains", "y", tuned, 10.0, 1.0),
+                Panel("(c) effect of a alone, published gains", "(y - 1)·10³", rest, 15.0, 0.0, 1e3),
             ]
         ]
         every = max(1, len(time) // DATA_ROWS)
@@ -283,7 +283,8 @@ def variation_response(gains: Gains, a: float, change_at: float) -> np.ndarray:
     case = paper_case("sprott")
     own = case.signals[VARIATION_EPISODES[a]]
     length = float(own.time[-1]) - CHANGE_AT
-    lines = ("0 setpoint 1", f"{change_at:g} plant.a {a:g}", f"{change_at + length:g} end")
+    nominal = f"0 plant.a {case.plant_values['a']:g}"
+    lines = ("0 setpoint 1", nominal, f"{change_at:g} plant.a {a:g}", f"{change_at + length:g} end")
     y = replace(case, episodes={"varied": lines}).simulate("varied", gains).output[:, 0]
     return np.asarray(y[round(change_at / case.sample_period) :] - 1.0)
 

@@ -14,11 +14,10 @@ DIVERGED = 1e100  # |y| beyond it: the lane stays where it was, so that no infin
 
 
 @compiled
-def advance_sound(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
-    """The plant's state one step on, and whether the lane is sound; a lane that diverges stays where it was."""
+def advance_bounded(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
+    """The plant's state one step on; a lane that diverges stays where it was."""
     moved = plant_advance(plant, x, v_old, v_new, d)
-    sound = abs(plant_output(plant, moved)) < DIVERGED
-    return either(sound, moved, x), sound
+    return either(abs(plant_output(plant, moved)) < DIVERGED, moved, x)
 
 
 @compiled
@@ -46,7 +45,7 @@ def advance_lanes(
     for j in range(lanes):
         u_applied[j] = applied(u[j], limits)
         ring[new * lanes + j] = plant_input(plant, u_applied[j], d[j])
-        state, _ = advance_sound(
+        state = advance_bounded(
             plant, loaded(like, x, j, lanes), ring[oldest * lanes + j], ring[due * lanes + j], d[j]
         )
         store(state, x, j, lanes)

@@ -9,6 +9,7 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.loop import Integrals
+from tdof_npid_ros.plants import linear
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.objective import LARGEST_IAE, Objective, objective_values
@@ -78,6 +79,14 @@ def test_values_do_not_depend_on_the_number_of_threads(count: int) -> None:
     assert one.shape == (count,)
     for other in others:
         assert np.array_equal(one, other)
+
+
+def test_the_first_values_of_a_process_are_the_same_on_any_number_of_threads() -> None:
+    some, values = candidates(64), []
+    for threads in (1, 8, 8, 8):
+        linear._sample.cache_clear()  # mpmath's precision is global: threads that discretise at once spoil it
+        values.append(Objective(PROBLEM, threads)(some))
+    assert all(np.array_equal(values[0], other) for other in values)
 
 
 def test_values_do_not_depend_on_the_company_of_other_candidates() -> None:

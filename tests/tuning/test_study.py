@@ -166,7 +166,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(tmp_path: Path, monkeypatc
     with pytest.raises(TuningError, match="cannot be written: No space left on device"):
         after(3, study)
     assert (tmp_path / "c").read_bytes() == before
-    assert os.listdir(tmp_path) == ["c"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "c"]
 
 
 CHILD = """

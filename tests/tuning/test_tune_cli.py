@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -145,7 +144,7 @@ def test_nothing_is_written_when_anything_is_refused(tmp_path: Path, capsys: pyt
     refused(capsys, *QUICK, "--controller", "pid", *outputs, *checkpoint)
     refused(capsys, *QUICK, "--controller", "pid", *outputs, *checkpoint, "--resume")
     refused(capsys, *QUICK, "--controller", "fuzzy", *outputs)
-    assert sorted(os.listdir(tmp_path)) == ["checkpoint", "gains.yaml"]
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint", "gains.yaml"}
     assert (tmp_path / "gains.yaml").read_text() == "mine"
     assert (tmp_path / "checkpoint").read_text() == "mine too"
 

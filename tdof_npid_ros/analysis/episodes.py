@@ -1,0 +1,246 @@
+"""Every episode in a bag: runs of a plan in lockstep, and stretches of a realtime loop or of a robot."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tdof_npid_ros.analysis.errors import AnalysisError
+from tdof_npid_ros.analysis.parameters import ParameterHistory, gains_by_digest
+from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.case import read_episodes, sample_period_in_ns
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.stamps import RESTART_NS
+from tdof_npid_ros.scenario import Plan, parse_plan
+
+UNPLANNED = "recording"  # the name of an episode without a plan
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A stretch of a loop, on the grid of its sample period.
+
+    Attributes:
+        bag, namespace: where it is from.
+        name: of its plan in the scenario, or the plan's digest, or `recording`.
+        number: the plant's count in lockstep, else the count in the bag.
+        plan: None in a bag without, and in realtime, where setpoint and disturbance come from their topics.
+        sample_period_ns: of the outputs.
+        start_ns: when the first output was published, ns since the epoch.
+        time: s, (samples,).
+        setpoint, output, control_effort: (samples, lanes); NaN where the bag does not hold them.
+        disturbance: (samples,).
+        gains: every set of controller parameters that answered, in order; empty where the bag does not hold them.
+        plant: the parameters of the simulated plant; empty where the bag does not hold them.
+        missing: outputs that the plan has and the bag has not.
+    """
+
+    bag: str
+    namespace: str
+    name: str
+    number: int
+    plan: Plan | None
+    sample_period_ns: int
+    start_ns: int
+    time: np.ndarray
+    setpoint: np.ndarray
+    disturbance: np.ndarray
+    output: np.ndarray
+    control_effort: np.ndarray
+    gains: tuple[Gains, ...]
+    plant: Mapping[str, object]
+    missing: int
+
+    @property
+    def lanes(self) -> int:
+        """Number of independent loops, or of a robot's joints."""
+        return int(self.output.shape[1])
+
+    @property
+    def controller(self) -> str:
+        """Type of the controller; empty where the bag does not tell."""
+        return ", ".join(dict.fromkeys(gains.type for gains in self.gains))
+
+
+def read_episodes_of(path: str | Path) -> list[Episode]:
+    """The episodes in a bag, in the order in which they began.
+
+    Raises:
+        AnalysisError: there is no output in it, or none of two samples.
+        BagError: no bag, or it is damaged.
+    """
+    with BagReader(path) as reader:
+        loops = read_loops(reader, str(path))
+    found = [episode for loop in loops for episode in _episodes(loop)]
+    if not found:
+        raise AnalysisError(f"{path}: no episode of at least two outputs in it: record longer")
+    return sorted(found, key=lambda episode: episode.start_ns)
+
+
+def _episodes(loop: Loop) -> Iterator[Episode]:
+    names = _plan_names(loop.scenario, loop.plans)
+    answers = loop.control_effort
+    by_episode: dict[str, list[slice]] = defaultdict(list)
+    for stretch in _stretches(answers) if answers is not None else []:
+        by_episode[_episode_of(answers, stretch)].append(stretch)  # type: ignore[arg-type]
+    gains = {digest: gains for digest, (gains, _) in gains_by_digest(loop.histories).items()}
+    for count, stretch in enumerate(_stretches(loop.output), start=1):
+        frame = str(loop.output.frame_id[stretch.start])
+        planned = "/" in frame
+        if planned:
+            mine = by_episode[frame].pop(0) if by_episode[frame] else slice(0, 0)
+        else:
+            mine = _published_during(loop.output, stretch, answers)
+        episode = _episode(loop, stretch, frame if planned else "", count, answers, mine, gains, names)
+        if episode is not None:
+            yield episode
+
+
+def _stretches(signal: Signal) -> list[slice]:
+    """Stretches of one episode each: the frame_id's episode stays the same and no stamp goes back to a start."""
+    if not len(signal):
+        return []
+    stamps = signal.stamp_ns
+    back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > RESTART_NS))
+    starts = {0, *(np.flatnonzero(back) + 1).tolist()}
+    runs = signal.runs()
+    for before, run in zip(runs, runs[1:], strict=False):
+        if _episode_of(signal, before) != _episode_of(signal, run):
+            starts.add(run.start)
+    ordered = [*sorted(starts), len(signal)]
+    return [slice(a, b) for a, b in zip(ordered, ordered[1:], strict=False)]
+
+
+def _episode_of(signal: Signal, stretch: slice) -> str:
+    """What a frame_id says of the episode, after the digest of the parameters that an answer has before it."""
+    return str(signal.frame_id[stretch.start]).rpartition(" ")[2] if "/" in signal.frame_id[stretch.start] else ""
+
+
+def _published_during(output: Signal, stretch: slice, answers: Signal | None) -> slice:
+    if answers is None:
+        return slice(0, 0)
+    first = int(output.publish_ns[stretch.start])
+    after = int(output.publish_ns[stretch.stop]) if stretch.stop < len(output) else None
+    a = int(np.searchsorted(answers.publish_ns, first))
+    return slice(a, len(answers) if after is None else int(np.searchsorted(answers.publish_ns, after)))
+
+
+def _episode(
+    loop: Loop,
+    stretch: slice,
+    frame: str,
+    count: int,
+    answers: Signal | None,
+    mine: slice,
+    gains: Mapping[str, Gains],
+    names: Mapping[str, str],
+) -> Episode | None:
+    stamps, first = np.unique(loop.output.stamp_ns[stretch], return_index=True)
+    if len(stamps) < 2:
+        return None
+    rows = _rows(loop.output.position[stretch], loop.bag)[first]
+    if not rows.shape[1]:
+        return None
+    period_ns = int(np.median(np.diff(stamps)))
+    digest, _, number = frame.partition("/")
+    plan = loop.plans.get(digest)
+    grid = _grid(stamps, period_ns, plan)
+    hold = not frame
+    output = _on_grid(grid, stamps, rows, hold)
+    setpoint, effort = np.full((2, *output.shape), np.nan)
+    digests: list[str] = []
+    if answers is not None and mine.stop > mine.start:
+        effort_stamps, index = np.unique(answers.stamp_ns[mine], return_index=True)
+        effort_rows, setpoint_rows = (_rows(c[mine], loop.bag)[index] for c in (answers.effort, answers.position))
+        effort = _on_grid(grid, effort_stamps, _widened(effort_rows, output), hold)
+        setpoint = _on_grid(grid, effort_stamps, _widened(setpoint_rows, output), hold)
+        changes = np.flatnonzero(answers.frame_id[mine][1:] != answers.frame_id[mine][:-1]) + 1
+        digests = [str(answers.frame_id[mine][i]).partition(" ")[0] for i in (0, *changes)]
+    start_ns = int(loop.output.publish_ns[stretch.start])
+    if plan is not None:
+        signals = plan.sampled(period_ns)
+        setpoint = np.repeat(signals.setpoint[:, None], output.shape[1], axis=1)
+        disturbance = signals.disturbance
+    else:
+        if np.isnan(setpoint).all() and loop.setpoint is not None:
+            setpoint = np.repeat(_live(loop.setpoint, "position", loop, stretch, grid)[:, None], output.shape[1], axis=1)
+        disturbance = _live(loop.disturbance, "effort", loop, stretch, grid)
+    return Episode(
+        bag=loop.bag,
+        namespace=loop.namespace,
+        name=names.get(digest, digest) or UNPLANNED,
+        number=int(number) if number.isdigit() else count,
+        plan=plan,
+        sample_period_ns=period_ns,
+        start_ns=start_ns,
+        time=grid / 1e9,
+        setpoint=setpoint,
+        disturbance=disturbance,
+        output=output,
+        control_effort=effort,
+        gains=tuple(gains[name] for name in digests if name in gains) if set(digests) <= gains.keys() else (),
+        plant=loop.plant.at(start_ns) if loop.plant is not None else {},
+        missing=int(np.isnan(output).any(axis=1).sum()),
+    )
+
+
+def _rows(values: np.ndarray, bag: str) -> np.ndarray:
+    """One row per message, (messages, lanes)."""
+    if values.dtype != object:
+        return values
+    if len({len(row) for row in values}) > 1:
+        raise AnalysisError(f"{bag}: the number of values changes within an episode: it cannot be analysed")
+    return np.stack(list(values))
+
+
+def _widened(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """One value for all lanes becomes one per lane; what does not fit is not known."""
+    lanes = like.shape[1]
+    if rows.shape[1] == lanes:
+        return rows
+    return np.repeat(rows, lanes, axis=1) if rows.shape[1] == 1 else np.full((len(rows), lanes), np.nan)
+
+
+def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None) -> np.ndarray:
+    """Stamps k·h, of the whole plan or from the first output to the last."""
+    if plan is not None:
+        return np.arange(plan.steps(period_ns) + 1, dtype=np.int64) * period_ns
+    return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)
+
+
+def _on_grid(grid: np.ndarray, stamps: np.ndarray, rows: np.ndarray, hold: bool) -> np.ndarray:
+    """Rows by the stamps of the grid; where there is none, NaN, or (hold) the row before."""
+    at = np.searchsorted(stamps, grid, side="right") - 1
+    values = rows[np.maximum(at, 0)].astype(np.float64)
+    values[at < 0 if hold else (at < 0) | (stamps[np.maximum(at, 0)] != grid)] = np.nan
+    return values
+
+
+def _live(signal: Signal | None, field: str, loop: Loop, stretch: slice, grid: np.ndarray) -> np.ndarray:
+    """What was published on a topic last before each output, (samples,); 0 before the first."""
+    if signal is None or not len(signal):
+        return np.zeros(len(grid))
+    values = np.array([row[0] if len(row) else 0.0 for row in getattr(signal, field)])
+    at = np.searchsorted(signal.publish_ns, loop.output.publish_ns[stretch], side="right") - 1
+    column = np.where(at < 0, 0.0, values[np.maximum(at, 0)])
+    stamps, first = np.unique(loop.output.stamp_ns[stretch], return_index=True)
+    return _on_grid(grid, stamps, column[first][:, None], hold=True)[:, 0]
+
+
+def _plan_names(scenario: ParameterHistory | None, plans: Mapping[str, Plan]) -> dict[str, str]:
+    """What the scenario calls the plans, by digest."""
+    names: dict[str, str] = {}
+    for _, values in scenario.sets() if scenario is not None else ():
+        if "sample_period" not in values:
+            continue
+        try:
+            for name, lines in read_episodes(values).items():
+                names[parse_plan(lines, sample_period_in_ns(values["sample_period"])).digest] = name
+        except ValueError:
+            continue  # parameters come one by one: not all of them yet
+    return {digest: name for digest, name in names.items() if digest in plans}

@@ -1,0 +1,266 @@
+"""Real nodes as real processes over real DDS, for the tests of the graph.
+
+A test takes the fixture `graph`: a DDS domain of its own, in which it starts nodes and looks on through one node of
+its own. Nothing sleeps for a fixed time: `wait_until` spins until a condition holds.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tdof_npid_ros.parameter_file import read_parameters, write_parameters
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the ROS 2 wheels restart the interpreter with their libraries, before pytest's capture would swallow it."""
+    if not os.environ.get("_ROS_WHEELS_BOOTSTRAP_COMPLETE"):
+        capture = config.pluginmanager.getplugin("capturemanager")
+        capture.stop_global_capturing()
+        import rclpy  # noqa: F401  (does not return)
+
+        capture.start_global_capturing()
+
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DOMAINS = 10  # used in turn, so that a killed node's remains are gone when its domain comes round again
+START_TIMEOUT = 60.0  # s; generous, for a loaded machine
+DOMAIN_NUMBERS = itertools.count()
+
+
+class NodeProcess:
+    """A node in a process of its own; what it prints is in `log`."""
+
+    def __init__(self, node: str, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        self.node = node
+        self._log = log
+        self.expected_status: int | None = 0
+        with log.open("w") as stream:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "tdof_npid_ros.graph", node, *arguments],
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                cwd=REPOSITORY,
+                env=environment,
+            )
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def send(self, signal_number: int) -> None:
+        self.process.send_signal(signal_number)
+        if signal_number == signal.SIGKILL:
+            self.expected_status = None
+            self.process.wait()
+
+    def stop(self, timeout: float = 10.0) -> float:
+        """Ctrl-C; returns after how many seconds the process had ended."""
+        began = time.monotonic()
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.send_signal(signal.SIGINT)
+        try:
+            self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        return time.monotonic() - began
+
+
+class Graph:
+    """A DDS domain with nodes in it, and a node of the test's own that looks on.
+
+    Attributes:
+        node: the test's own node, for whatever the methods here do not do.
+        diagnostics: the latest facts by a node's full name; `level` and `message` are among them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.experimental import EventsExecutor
+
+        base = int(os.environ.get("ROS_DOMAIN_ID", os.getpid() * DOMAINS % 90))
+        self.domain = (base + next(DOMAIN_NUMBERS) % DOMAINS) % 102
+        self.folder = folder
+        self.environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(self.domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]),
+        }
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.processes: list[NodeProcess] = []
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=self.domain)
+        self.node = rclpy.create_node("test", context=self._context)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.diagnostics: dict[str, dict[str, Any]] = {}
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+
+    def close(self) -> None:
+        for process in self.processes:
+            if process.process.poll() is None:
+                process.process.send_signal(signal.SIGCONT)
+                process.process.send_signal(signal.SIGINT)
+        for process in self.processes:
+            process.stop()
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+        self._context.shutdown()
+
+    # Nodes
+
+    def start(self, node: str, *arguments: str, case: str = "", namespace: str = "", **parameters: Any) -> NodeProcess:
+        """Start a node.
+
+        Args:
+            arguments: more of its `--ros-args`.
+            case: name of a file in config/, or a path, whose parameters it gets.
+            namespace: to start it in.
+            parameters: after those of the case; dots in names as double underscores.
+        """
+        values = dict(parameters)
+        if case:
+            path = Path(case) if case.endswith(".yaml") else REPOSITORY / "config" / f"{case}.yaml"
+            values = read_parameters(path, node) | values
+        command = ["--ros-args", *arguments]
+        if namespace:
+            command += ["-r", f"__ns:={namespace}"]
+        if values:
+            file = self.folder / f"{node}-{len(self.processes)}.yaml"
+            write_parameters(file, {node: {name.replace("__", "."): plain(value) for name, value in values.items()}})
+            command += ["--params-file", str(file)]
+        log = self.folder / f"{node}-{len(self.processes)}.log"
+        process = NodeProcess(node, command, self.environment, log)
+        self.processes.append(process)
+        return process
+
+    def wait_for_nodes(self, *names: str) -> None:
+        """Wait until nodes of these full names report on /diagnostics."""
+        for name in names:
+            self.diagnostics.pop(name, None)
+        self.wait_until(lambda: all(name in self.diagnostics for name in names), START_TIMEOUT, f"{names} to report")
+
+    # Waiting
+
+    def spin_once(self, timeout: float = 0.05) -> None:
+        self._executor.spin_once(timeout_sec=timeout)
+
+    def wait_until(self, condition: Callable[[], Any], timeout: float = 20.0, what: str = "a condition") -> Any:
+        """Spin until the condition holds; its value is returned."""
+        end = time.monotonic() + timeout
+        while not (value := condition()):
+            if time.monotonic() > end:
+                logs = "\n".join(f"--- {process.node}:\n{process.log}" for process in self.processes)
+                pytest.fail(f"waited {timeout:g} s in vain for {what}\n{logs}\n--- diagnostics: {self.diagnostics}")
+            self.spin_once()
+        return value
+
+    def wait_for_log(self, process: NodeProcess, text: str, timeout: float = 20.0) -> None:
+        self.wait_until(lambda: text in process.log, timeout, f"{text!r} in the log of {process.node}")
+
+    def fact(self, node: str, name: str, default: Any = "") -> Any:
+        """A fact of a node's latest diagnostics."""
+        return self.diagnostics.get(node, {}).get(name, default)
+
+    # Topics, services, parameters
+
+    def collect(self, topic: str, message_type: Any, qos: Any = 10_000) -> list[Any]:
+        """Every message that arrives on a topic from now on, in a list that grows."""
+        messages: list[Any] = []
+        self.node.create_subscription(message_type, topic, messages.append, qos)
+        return messages
+
+    def publisher(self, topic: str, message_type: Any, qos: Any = 10) -> Any:
+        """A publisher that is already matched with a subscription."""
+        publisher = self.node.create_publisher(message_type, topic, qos)
+        self.wait_until(publisher.get_subscription_count, START_TIMEOUT, f"a subscriber of {topic}")
+        return publisher
+
+    def call(self, service: str, service_type: Any, request: Any = None, timeout: float = START_TIMEOUT) -> Any:
+        client = self.node.create_client(service_type, service)
+        try:
+            self.wait_until(client.service_is_ready, timeout, f"the service {service}")
+            future = client.call_async(request or service_type.Request())
+            self.wait_until(future.done, timeout, f"an answer of {service}")
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def set_parameters(self, node: str, atomically: bool = False, **values: Any) -> list[Any]:
+        """Set parameters of a node; returns the results (`successful`, `reason`), one for all if atomically."""
+        from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+        from rclpy.parameter import Parameter
+
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        if atomically:
+            service = SetParametersAtomically
+            return [self.call(f"{node}/set_parameters_atomically", service, service.Request(parameters=parameters)).result]
+        request = SetParameters.Request(parameters=parameters)
+        return list(self.call(f"{node}/set_parameters", SetParameters, request).results)
+
+    def get_parameters(self, node: str, *names: str) -> list[Any]:
+        from rcl_interfaces.srv import GetParameters
+        from rclpy.parameter import parameter_value_to_python
+
+        values = self.call(f"{node}/get_parameters", GetParameters, GetParameters.Request(names=list(names))).values
+        return [parameter_value_to_python(value) for value in values]
+
+    def change_state(self, node: str, transition: str) -> bool:
+        """Ask for a transition of a node's life cycle: configure, activate, deactivate, cleanup."""
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        number = getattr(Transition, f"TRANSITION_{transition.upper()}")
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self.call(f"{node}/change_state", ChangeState, request).success)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            facts = {pair.key: pair.value for pair in status.values}
+            self.diagnostics[status.name] = {**facts, "level": status.level[0], "message": status.message}
+
+
+def plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    """A domain of the test's own. At its end every node is stopped and must end quietly, with exit status 0."""
+    graph = Graph(tmp_path)
+    try:
+        yield graph
+    finally:
+        graph.close()
+    check_endings(graph)
+
+
+@pytest.fixture(scope="module")
+def shared_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+    """As `graph`, shared by the tests of a module."""
+    graph = Graph(tmp_path_factory.mktemp("graph"))
+    try:
+        yield graph
+    finally:
+        graph.close()
+    check_endings(graph)
+
+
+def check_endings(graph: Graph) -> None:
+    for process in graph.processes:
+        assert "Traceback" not in process.log, process.log
+        if process.expected_status is not None:
+            assert process.process.returncode == process.expected_status, process.log

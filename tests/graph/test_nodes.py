@@ -1,0 +1,222 @@
+"""The loop's nodes as processes: E1, order of starting, refusals, endings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.case import load_case
+
+SHORT = {
+    "p1-c0.5": ("0 setpoint 1", "0.5 disturbance 0.5", "1.5 end"),
+    "sprott": ("0 setpoint 1", "0 plant.a 0.6", "0.2 plant.a 0.72", "0.5 end"),
+}
+
+
+def run_short(graph: Any, case: str, lanes: int = 1, **controller: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Run the short plan of a case; returns its outputs and efforts, (steps + 1, lanes)."""
+    from sensor_msgs.msg import JointState
+
+    outputs, efforts = graph.collect("output", JointState), graph.collect("control_effort", JointState)
+    graph.start("plant", case=case, lanes=lanes)
+    graph.start("controller", case=case, **controller)
+    graph.start("scenario", case=case, episodes=["short"], plan__short=list(SHORT[case]))
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 60, "the end of the episode")
+    steps = load_short(case).signals["short"].steps
+    graph.wait_until(lambda: efforts and stamps(efforts)[-1] == stamps(outputs)[-1], what="the last answer")
+    y = {s: m.position for s, m in zip(stamps(outputs), outputs, strict=True)}
+    u = {s: m.effort for s, m in zip(stamps(efforts), efforts, strict=True)}
+    assert len(y) == len(u) == steps + 1
+    return np.array([y[s] for s in sorted(y)]), np.array([u[s] for s in sorted(u)])
+
+
+def load_short(case: str) -> Any:
+    return dataclasses.replace(load_case(case), episodes={"short": SHORT[case]})
+
+
+def stamps(messages: list[Any]) -> list[int]:
+    return [m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec for m in messages]
+
+
+@pytest.mark.parametrize("case", ["p1-c0.5", "sprott"])
+def test_distributed_equals_local(graph: Any, case: str) -> None:
+    y, u = run_short(graph, case)
+    local = load_short(case).simulate("short")
+    assert np.array_equal(y, local.output)
+    assert np.array_equal(u, local.control_effort)
+
+
+def test_distributed_equals_local_with_lanes(graph: Any) -> None:
+    gains = load_case("p1-c0.5").gains.with_values(kp=(9.4, 5.0, 2.0), alpha=(0.3, 0.2, 0.0))
+    y, u = run_short(graph, "p1-c0.5", lanes=3, kp=gains.kp, alpha=gains.alpha)
+    local = load_short("p1-c0.5").simulate("short", gains)
+    assert np.array_equal(y, local.output)
+    assert np.array_equal(u, local.control_effort)
+
+
+def test_nodes_start_in_any_order_in_a_namespace_and_end_at_once(graph: Any) -> None:
+    scenario = graph.start("scenario", namespace="/a", mode="lockstep", episodes=["e"],
+                           plan__e=["0 setpoint 1", "1 end"])  # fmt: skip
+    graph.wait_for_nodes("/a/scenario")
+    controller = graph.start("controller", namespace="/a")
+    plant = graph.start("plant", namespace="/a", mode="lockstep")
+    graph.wait_until(lambda: graph.fact("/a/plant", "state") == "finished", 60, "the end of the episode")
+    for process in (plant, controller, scenario):
+        assert process.stop() < 1.0
+
+
+def test_controller_killed_and_restarted(graph: Any) -> None:
+    plant = graph.start("plant", mode="lockstep", reply_timeout=0.05, retries=2)
+    controller = graph.start("controller")
+    graph.start("scenario", mode="lockstep", episodes=["e"], plan__e=["0 setpoint 1", "3000 end"])
+    graph.wait_until(lambda: int(graph.fact("/plant", "steps", 0)) > 100, 60, "steps")
+    controller.send(signal.SIGKILL)
+    graph.wait_for_log(plant, "stopped")
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "stopped")
+    assert "start one" in graph.fact("/plant", "message")
+    before = int(graph.fact("/plant", "steps"))
+    graph.start("controller")
+    graph.wait_until(lambda: int(graph.fact("/plant", "steps")) > before + 100, 60, "more steps")
+
+
+@pytest.mark.parametrize(
+    ("node", "parameters", "reason"),
+    [
+        ("controller", {"kp": "much"}, "kp"),
+        ("controller", {"sigma": -1.0}, "sigma"),
+        ("controller", {"sample_period": 0.0}, "sample_period"),
+        ("plant", {"mode": "fast"}, "mode"),
+        ("plant", {"model": "no.such:Plant"}, "no.such"),
+        ("plant", {"lanes": 0}, "lanes"),
+        ("scenario", {"episodes": ["missing"], "plan__missing": ["0 setpoint 1"]}, "end"),
+    ],
+)
+def test_bad_start_parameters_are_one_line_and_status_2(
+    graph: Any, node: str, parameters: dict[str, Any], reason: str
+) -> None:
+    process = graph.start(node, **parameters)
+    process.expected_status = 2
+    assert process.process.wait(30) == 2
+    lines = process.log.strip().splitlines()
+    assert len(lines) == 1 and reason in lines[0], process.log
+
+
+class TestController:
+    """Refusals of one controller that goes on."""
+
+    @pytest.fixture(scope="class")
+    def loop(self, shared_graph: Any) -> Any:
+        from sensor_msgs.msg import JointState
+
+        shared_graph.process = shared_graph.start("controller", case="p1-c0.5", namespace="/c")
+        shared_graph.efforts = shared_graph.collect("/c/control_effort", JointState)
+        shared_graph.output = shared_graph.publisher("/c/output", JointState)
+        shared_graph.time_ns = 0
+        shared_graph.wait_for_nodes("/c/controller")
+        return shared_graph
+
+    def answer(self, loop: Any, *position: float) -> Any:
+        publish_output(loop, *position)
+        count = len(loop.efforts)
+        loop.wait_until(lambda: len(loop.efforts) > count, what="an answer")
+        return loop.efforts[-1]
+
+    @pytest.mark.parametrize(
+        ("values", "reason"),
+        [
+            ({"kp": math.nan}, "kp is nan"),
+            ({"kp": math.inf}, "finite"),
+            ({"kp": "high"}, "number"),
+            ({"kp": [1.0, math.nan]}, "nan"),
+            ({"kp": [1.0, 2.0], "ki": [1.0, 2.0, 3.0]}, "lanes"),
+            ({"kp": True}, "number"),
+            ({"sigma": 0.0}, "above 0"),
+            ({"type": "fuzzy"}, "one of"),
+            ({"anti_windup": "magic"}, "one of"),
+            ({"kp": 3.0, "n": -1.0}, "n is"),
+            ({"effort_min": 1.0, "effort_max": -1.0}, "effort_min"),
+            ({"sample_period": 0.1}, "read"),
+        ],
+    )
+    def test_bad_parameters_are_refused_whole(self, loop: Any, values: dict[str, Any], reason: str) -> None:
+        names = ["kp", "ki", "sigma", "n", "type", "effort_min", "effort_max", "sample_period"]
+        before = loop.get_parameters("/c/controller", *names)
+        (result,) = loop.set_parameters("/c/controller", atomically=True, **values)
+        assert not result.successful
+        assert reason in result.reason
+        assert loop.get_parameters("/c/controller", *names) == before
+
+    def test_good_parameters_are_logged_old_and_new(self, loop: Any) -> None:
+        assert loop.set_parameters("/c/controller", effort_max=50)[0].successful
+        loop.wait_for_log(loop.process, "effort_max: inf -> 50")
+
+    @pytest.mark.parametrize("bad", [(math.nan,), (math.inf,), (), (1.0, 2.0)])
+    def test_bad_outputs_are_counted_and_change_nothing(self, loop: Any, bad: tuple[float, ...]) -> None:
+        self.answer(loop, 0.1)
+        rejected = int(loop.fact("/c/controller", "rejected", 0))
+        answered, latest = len(loop.efforts), loop.efforts[-1]
+        for _ in range(20):
+            publish_output(loop, *bad)
+        loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 20, what="20 rejections")
+        assert len(loop.efforts) == answered
+        loop.time_ns -= 20 * 5_000_000
+        loop.time_ns -= 5_000_000
+        assert self.answer(loop, 0.1).effort == latest.effort  # the same stamp again: no state has advanced
+        loop.wait_until(lambda: "refused (further ones are only counted" in loop.process.log)
+
+    def test_bad_setpoints_are_refused(self, loop: Any) -> None:
+        from sensor_msgs.msg import JointState
+
+        setpoint = loop.publisher("/c/setpoint", JointState)
+        rejected = int(loop.fact("/c/controller", "rejected", 0))
+        for position in ([math.nan], [1.0, 2.0, 3.0], [], [-math.inf]):
+            setpoint.publish(JointState(position=position))
+        loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 4, what="4 rejections")
+        assert list(self.answer(loop, 0.1).position) == [0.0]
+        assert loop.process.log.count("setpoint") == 1
+
+    def test_bad_plans_are_refused(self, loop: Any) -> None:
+        from builtin_interfaces.msg import Duration
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+        plan = loop.publisher(
+            "/c/scenario_plan", JointTrajectory, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        )
+        rejected = int(loop.fact("/c/controller", "rejected", 0))
+        point = JointTrajectoryPoint(positions=[math.nan])
+        for message in (
+            JointTrajectory(),
+            JointTrajectory(joint_names=["nonsense"], points=[point, point]),
+            JointTrajectory(joint_names=["setpoint"], points=[point, JointTrajectoryPoint(
+                positions=[1.0], time_from_start=Duration(sec=1))]),
+        ):  # fmt: skip
+            plan.publish(message)
+        loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 3, what="3 rejections")
+
+    def test_idle_uses_no_measurable_processor_time(self, loop: Any) -> None:
+        stat = Path(f"/proc/{loop.process.process.pid}/stat")
+
+        def ticks() -> int:
+            fields = stat.read_text().rsplit(")", 1)[1].split()
+            return int(fields[11]) + int(fields[12])
+
+        before, end = ticks(), time.monotonic() + 2.0
+        loop.wait_until(lambda: time.monotonic() > end, what="2 s")
+        assert ticks() - before <= 6  # of 200 hundredths of a second; it publishes diagnostics once a second
+
+
+def publish_output(loop: Any, *position: float) -> None:
+    from sensor_msgs.msg import JointState
+
+    loop.time_ns += 5_000_000
+    message = JointState(position=position)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(loop.time_ns, 1_000_000_000)
+    loop.output.publish(message)

@@ -1,0 +1,170 @@
+"""`reproduce` writes what it promises, says what deviates, and leaves other people's files alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tdof_npid_ros.cli import main
+from tdof_npid_ros.paper import findings
+from tdof_npid_ros.paper.conclusions import TOLERANCES
+from tdof_npid_ros.paper.evaluation import deviation_percent, evaluate_row, measure, paper_case, published_gains
+from tdof_npid_ros.paper.items import ITEMS, SETTLED_AT, variation_metrics
+from tdof_npid_ros.paper.output import MARKER, OutputError, claim_folder
+from tdof_npid_ros.paper.report import Figure, Table
+from tdof_npid_ros.paper.reproduce import Effort, Reproduction, reproduce
+from tdof_npid_ros.paper.tables import ROWS, VARIATIONS, Published, PublishedVariation
+
+QUICK = Effort(seeds=1, generations=3, pareto_generations=3)
+REPRODUCED_CASES = ("p1-c4", "p2-c2", "p2-c5")
+PNG_SIGNATURE = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Reproduction]:
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    reproduction = Reproduction(effort=QUICK)
+    reproduce(folder, reproduction)
+    return folder, reproduction
+
+
+def row_of(case: str, controller: str) -> Published:
+    return next(row for row in ROWS if (row.case, row.controller) == (case, controller))
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS if row.case in REPRODUCED_CASES], ids=lambda row: f"{row[0]}-{row[1]}"
+)
+def test_published_rows_come_out_at_the_published_gains(row: Published) -> None:
+    ours = measure(paper_case(row.case), published_gains(row))
+    assert abs(ours.number("overshoot_percent") - row.overshoot_percent) <= TOLERANCES["overshoot_percent"]
+    for metric in ("iae_setpoint", "iae_disturbance", "peak"):
+        assert ours.number(metric) == pytest.approx(getattr(row, metric), rel=TOLERANCES[metric] / 100)
+
+
+def test_every_table_and_figure_is_written(whole: tuple[Path, Reproduction]) -> None:
+    folder, _ = whole
+    for name in ITEMS:
+        assert (folder / f"{name}.csv").stat().st_size > 0
+        if name.startswith("figure"):
+            assert (folder / f"{name}.png").read_bytes()[:4] == PNG_SIGNATURE
+        else:
+            assert (folder / f"{name}.md").read_text().startswith("### Table")
+
+
+def test_the_items_are_those_of_the_paper() -> None:
+    assert sorted(ITEMS) == sorted(
+        [*(f"table{i}" for i in range(1, 10)), "figure1", *(f"figure{i}" for i in range(6, 17))]
+    )
+
+
+def test_the_page_is_self_contained(whole: tuple[Path, Reproduction]) -> None:
+    folder, _ = whole
+    page = (folder / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == sum(name.startswith("figure") for name in ITEMS)
+    assert "http" not in page
+    assert all(heading in page for heading in ("In short", "What does not reproduce, and why"))
+
+
+def test_deviations_are_relative_to_the_published_value(whole: tuple[Path, Reproduction]) -> None:
+    folder, _ = whole
+    with (folder / "table4.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 6 * 7
+    for line in lines:
+        if line["ours, tuned"]:
+            expected = 100 * (float(line["ours, tuned"]) / float(line["published"]) - 1)
+            assert float(line["Δ tuned (%)"]) == pytest.approx(expected)
+
+
+def test_a_deviation_needs_both_numbers() -> None:
+    assert deviation_percent(1.1, 1.0) == pytest.approx(10.0)
+    assert deviation_percent(None, 1.0) is None
+    assert deviation_percent(1.0, 0.0) is None
+
+
+def test_the_summary_says_for_every_row_whether_it_reproduces(whole: tuple[Path, Reproduction]) -> None:
+    folder, _ = whole
+    summary = json.loads((folder / "summary.json").read_text())
+    assert len(summary["rows"]) == len(ROWS)
+    assert all(row["reproduced"] for row in summary["rows"] if row["case"] in REPRODUCED_CASES)
+    assert not any(row["reproduced"] for row in summary["rows"] if row["case"] in ("p1-c0.5", "sprott"))
+    assert len(summary["conclusions"]) == 14
+
+
+def test_only_writes_what_is_asked_for(tmp_path: Path) -> None:
+    reproduction = Reproduction(["figure1", "figure13"], QUICK)
+    reproduce(tmp_path / "out", reproduction)
+    assert {path.stem for path in (tmp_path / "out").iterdir()} == {"figure1", "figure13", "index", "summary", MARKER}
+    assert isinstance(reproduction.built["figure13"], Figure)
+
+
+def test_an_earlier_output_is_written_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        assert main(["reproduce", "--out", str(tmp_path / "out"), "--only", "figure1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["items"] == ["figure1"]
+
+
+def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    assert main(["reproduce", "--out", str(tmp_path), "--only", "figure1"]) == 2
+    assert capsys.readouterr().err.strip().endswith("give a new or an empty folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_the_output_of_another_subcommand_is_refused(tmp_path: Path) -> None:
+    claim_folder(tmp_path, "pareto")
+    with pytest.raises(OutputError, match="did not write"):
+        claim_folder(tmp_path, "reproduce")
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="is a file"):
+        claim_folder(tmp_path / "file", "reproduce")
+
+
+@pytest.mark.parametrize("arguments", [["--only", "table99"], ["--seeds", "0"]])
+def test_bad_arguments_are_refused_before_anything_is_written(arguments: list[str], tmp_path: Path) -> None:
+    assert main(["reproduce", "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_seeds_decide_the_outcome() -> None:
+    first, second = (evaluate_row(row_of("p1-c0.5", "pid"), seeds=2, generations=2).objectives for _ in range(2))
+    assert first == second
+    assert first[0] != first[1]
+
+
+@pytest.mark.parametrize("published", VARIATIONS, ids=lambda variation: f"{variation.controller}-{variation.a}")
+def test_table_9_is_that_of_a_loop_at_rest(published: PublishedVariation) -> None:
+    gains = published_gains(row_of("sprott", published.controller))
+    peak, iae, recovery = variation_metrics(gains, published.a, SETTLED_AT)
+    assert iae == pytest.approx(published.iae, rel=1e-4)
+    assert peak == pytest.approx(published.peak, rel=0.02)
+    assert 5.0 + recovery == pytest.approx(published.recovery_time_s, rel=0.01)
+
+
+def test_the_sprott_disturbance_behind_the_printed_numbers_is_5() -> None:
+    table = findings.sprott_disturbance().table
+    assert table is not None
+    for row in table.rows:
+        _, size, _, _, _, published, ours, _ = row
+        assert isinstance(ours, float) and isinstance(published, float)
+        assert (round(ours, 3) == published) == (size == 5.0)
+
+
+def test_process_1_fits_with_a_weaker_derivative_action() -> None:
+    gains = [(row, published_gains(row)) for row in ROWS if row.case == "p1-c0.5" and row.controller != "pid"]
+    for row, one in gains:
+        ours = measure(paper_case(row.case), one.with_values(kd=findings.WEAKER_DERIVATIVE * row.kd))
+        for metric in ("overshoot_percent", "settling_time_s", "iae_setpoint", "peak", "iae_disturbance"):
+            assert ours.number(metric) == pytest.approx(getattr(row, metric), rel=0.02)
+
+
+def test_a_table_shows_repeated_keys_once() -> None:
+    table = Table("t", "T", ("process", "controller", "Δ (%)"), (("a", "x", 1.25), ("a", "y", None)), 1)
+    assert table.shown() == [["a", "x", "+1.2"], ["", "y", "–"]]

@@ -1,0 +1,152 @@
+"""Plants are discretised exactly, and users bring their own."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.plant import Plant, PlantError
+from tdof_npid_ros.plants.simulator import PlantSimulator
+
+UNLIMITED = (-math.inf, math.inf)
+
+
+class Pendulum:
+    """A user's plant: a damped pendulum with a torque at its pivot."""
+
+    parameters = {"damping": 0.1, "stiffness": 9.81}
+    initial_state = (0.5, 0.0)
+
+    @staticmethod
+    def derivative(x, u, d, p):  # type: ignore[no-untyped-def]
+        return (x[1], u + d - p[0] * x[1] - p[1] * math.sin(x[0]))
+
+    @staticmethod
+    def output(x, p):  # type: ignore[no-untyped-def]
+        return x[0]
+
+
+class NotTuple(Pendulum):
+    @staticmethod
+    def derivative(x, u, d, p):  # type: ignore[no-untyped-def]
+        return x[1]
+
+
+def response(plant: Plant, efforts: np.ndarray, period: float) -> np.ndarray:
+    simulator = PlantSimulator(plant, round(period * 1e9), 1, UNLIMITED)
+    outputs = [simulator.output[0]]
+    for u in efforts:
+        simulator.advance(np.array([u]), np.zeros(1))
+        outputs.append(simulator.output[0])
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "transfer_function"),
+    [
+        ("first_order", {"time_constant": 5.0, "dead_time": 0.0}, ([1.0], [5.0, 1.0])),
+        ("second_order", {"time_constant": 2.0, "dead_time": 0.0}, ([1.0], [4.0, 4.0, 1.0])),
+        ("third_order", {"zero_time_constant": 2.0}, ([-2.0, 1.0], [1.0, 3.0, 3.0, 1.0])),
+        ("transfer_function", {"numerator": [1.0, 2.0], "denominator": [2.0, 0.3, 5.0]}, ([1.0, 2.0], [2.0, 0.3, 5.0])),
+    ],
+)
+def test_linear_plants_agree_with_scipys_discretisation(model: str, values: dict[str, object], transfer_function) -> None:  # type: ignore[no-untyped-def]
+    u = np.random.default_rng(3).normal(size=300)
+    ours = response(make_plant(model, values), u, 0.1)[:-1]
+    b, a, _ = signal.cont2discrete(transfer_function, 0.1, method="zoh")
+    theirs = signal.lfilter(np.ravel(b), a, u)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("dead_time", [0.0, 0.03, 0.1, 0.25, 0.3333, 1.0])
+def test_dead_time_is_exact_also_between_samples(dead_time: float) -> None:
+    """The step response of a delayed first-order lag, known in closed form."""
+    period, lag = 0.1, 0.7
+    y = response(make_plant("first_order", {"time_constant": lag, "dead_time": dead_time}), np.ones(40), period)
+    t = np.maximum(np.arange(41) * period - dead_time, 0.0)
+    np.testing.assert_allclose(y, 1.0 - np.exp(-t / lag), rtol=0, atol=1e-14)
+
+
+def test_parameters_that_change_do_not_make_the_output_jump() -> None:
+    simulator = PlantSimulator(make_plant("second_order", {}), 10_000_000, 1, UNLIMITED)
+    for _ in range(200):
+        simulator.advance(np.ones(1), np.zeros(1))
+    before = simulator.output[0]
+    simulator.change_plant(make_plant("second_order", {"time_constant": 3.0}))
+    simulator.advance(np.ones(1), np.zeros(1))
+    assert abs(simulator.output[0] - before) < 0.01
+
+
+def test_sprott_circuit_follows_an_independent_solver_until_chaos_parts_them() -> None:
+    from scipy.integrate import solve_ivp
+
+    start = (-1.0, -2.0, 1.0)
+    y = response(make_plant("sprott", {"initial_state": list(start)}), np.zeros(2000), 0.001)
+
+    def slope(t: float, x: np.ndarray) -> list[float]:
+        return [x[1], x[2], -1.2 * x[0] - x[1] - 0.6 * x[2] + 2 * np.sign(x[0])]
+
+    theirs = solve_ivp(slope, (0, 2), start, rtol=1e-11, atol=1e-12, max_step=0.001, t_eval=[2.0]).y[0, -1]
+    assert y[-1] == pytest.approx(theirs, abs=1e-3)
+
+
+def test_a_users_plant_is_integrated_with_fourth_order_accuracy() -> None:
+    from scipy.integrate import solve_ivp
+
+    path, times = f"{__name__}:Pendulum", np.linspace(0, 1, 11)
+    exact = solve_ivp(
+        lambda t, x: Pendulum.derivative(x, 0.0, 0.0, (0.1, 9.81)), (0, 1), (0.5, 0.0),
+        method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times,
+    ).y[0]  # fmt: skip
+    errors = [
+        np.max(np.abs(response(make_plant(path, {"substeps": substeps}), np.zeros(10), 0.1) - exact))
+        for substeps in (1, 2, 4)
+    ]
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
+    assert errors[1] / errors[2] == pytest.approx(16, rel=0.3)
+
+
+def test_lanes_of_a_users_plant_are_independent() -> None:
+    simulator = PlantSimulator(make_plant(f"{__name__}:Pendulum", {}), 10_000_000, 3, UNLIMITED)
+    for _ in range(50):
+        simulator.advance(np.array([0.0, 1.0, 2.0]), np.zeros(3))
+    assert len(set(simulator.output)) == 3
+
+
+def test_a_lane_that_diverges_stays_finite() -> None:
+    simulator = PlantSimulator(make_plant("transfer_function", {"denominator": [1.0, -50.0]}), 10_000_000, 1, UNLIMITED)
+    for _ in range(3000):
+        simulator.advance(np.ones(1), np.zeros(1))
+    assert math.isfinite(simulator.output[0])
+
+
+def test_the_plants_own_limits_are_applied_and_reported() -> None:
+    simulator = PlantSimulator(make_plant("first_order", {}), 10_000_000, 1, (-1.0, 0.5))
+    simulator.advance(np.array([3.0]), np.zeros(1))
+    assert simulator.applied_effort[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "word"),
+    [
+        ("no_such", {}, "no_such"),
+        ("first_order", {"time_constant": 0.0}, "time_constant"),
+        ("first_order", {"dead_time": -1.0}, "dead_time"),
+        ("first_order", {"gain": math.nan}, "gain"),
+        ("first_order", {"gain": "much"}, "gain"),
+        ("transfer_function", {"numerator": [1.0, 0.0], "denominator": [1.0, 1.0]}, "strictly proper"),
+        ("transfer_function", {"denominator": [0.0]}, "denominator"),
+        ("sprott", {"initial_state": [0.0]}, "initial_state"),
+        ("no.such.module:Plant", {}, "no.such.module"),
+        ("tests.test_plants:missing", {}, "missing"),
+        ("math:pi", {}, "not a plant class"),
+        (f"{__name__}:NotTuple", {}, "tuple"),
+    ],
+)
+def test_plants_that_cannot_be_built_are_refused_with_the_reason(
+    model: str, values: dict[str, object], word: str
+) -> None:
+    with pytest.raises(PlantError, match=word):
+        make_plant(model, values)

@@ -1,0 +1,87 @@
+"""Plans are read as written, and wrong lines are named."""
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.scenario import Plan, PlanError, parse_plan
+
+PERIOD_NS = 100_000_000
+
+
+def test_steps_hold_until_the_next_line() -> None:
+    signals = parse_plan(["0 setpoint 1", "0.5 disturbance -2", "1 setpoint 3", "2 end"], PERIOD_NS).sampled(PERIOD_NS)
+    assert signals.steps == 20
+    np.testing.assert_array_equal(signals.setpoint, [1.0] * 10 + [3.0] * 11)
+    np.testing.assert_array_equal(signals.disturbance, [0.0] * 5 + [-2.0] * 16)
+
+
+def test_a_ramp_goes_from_where_the_signal_is() -> None:
+    signals = parse_plan(["0 setpoint 1", "1 setpoint ramp 3 over 1", "3 end"], PERIOD_NS).sampled(PERIOD_NS)
+    np.testing.assert_allclose(signals.setpoint[10:21], np.linspace(1, 3, 11))
+    assert signals.setpoint[-1] == 3.0
+
+
+def test_a_sine_swings_about_where_the_signal_is_and_returns() -> None:
+    lines = ["0 setpoint 2", "1 setpoint sine 0.5 period 2 for 4", "6 end"]
+    signals = parse_plan(lines, PERIOD_NS).sampled(PERIOD_NS)
+    np.testing.assert_allclose(signals.setpoint[10:50], 2 + 0.5 * np.sin(np.pi * np.arange(40) * 0.1))
+    assert set(signals.setpoint[50:]) == {2.0}
+
+
+def test_a_later_line_ends_a_ramp() -> None:
+    lines = ["0 setpoint ramp 10 over 10", "1 setpoint 0", "2 end"]
+    signals = parse_plan(lines, PERIOD_NS).sampled(PERIOD_NS)
+    assert set(signals.setpoint[10:]) == {0.0}
+
+
+def test_plant_parameters_divide_the_episode() -> None:
+    signals = parse_plan(["0 plant.a 0.6", "1 plant.a 0.7", "2 end"], PERIOD_NS, ["a"]).sampled(PERIOD_NS)
+    assert [(s.first, s.last, s.plant) for s in signals.segments] == [(0, 10, {"a": 0.6}), (10, 20, {"a": 0.7})]
+
+
+def test_a_plans_name_depends_on_its_content_alone() -> None:
+    one, same = (parse_plan(["0 setpoint 1", "2 end"], PERIOD_NS) for _ in range(2))
+    other = parse_plan(["0 setpoint 1.0000000000000002", "2 end"], PERIOD_NS)
+    assert one.digest == same.digest != other.digest
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        ([], "end"),
+        (["0 setpoint 1"], "end"),
+        (["0 setpoint 1", "5 setpoint 2", "4 setpoint 3", "6 end"], "line 3 '4 setpoint 3'"),
+        (["0 speed 1", "1 end"], "line 1 '0 speed 1'"),
+        (["0 setpoint nan", "1 end"], "not finite"),
+        (["0 setpoint inf", "1 end"], "not finite"),
+        (["0 setpoint one", "1 end"], "not a number"),
+        (["-1 setpoint 1", "1 end"], "negative"),
+        (["0 setpoint", "1 end"], "line 1"),
+        (["0 setpoint ramp 1", "1 end"], "line 1"),
+        (["0 setpoint ramp 1 over -2", "1 end"], "above 0"),
+        (["0 plant.b 1", "1 end"], "unknown plant parameter"),
+        (["1 plant.a 1", "2 end"], "value at 0 s"),
+        (["0 setpoint 1", "0 end"], "samples"),
+        (["0 setpoint 1", "1 end", "2 setpoint 1"], "after the end"),
+    ],
+)
+def test_a_bad_plan_is_refused_with_the_line_that_is_wrong(lines: list[str], word: str) -> None:
+    with pytest.raises(PlanError, match=word):
+        parse_plan(lines, PERIOD_NS, ["a"])
+
+
+@pytest.mark.parametrize(
+    ("names", "times", "values", "word"),
+    [
+        (("setpoint",), (0,), ((1.0,),), "two points"),
+        (("setpoint",), (5, 10), ((1.0,), (1.0,)), "first point"),
+        (("setpoint",), (0, 10, 10), ((1.0,), (1.0,), (1.0,)), "not after"),
+        (("setpoint", "setpoint"), (0, 10), ((1.0, 1.0), (1.0, 1.0)), "twice"),
+        (("velocity",), (0, 10), ((1.0,), (1.0,)), "unknown"),
+        (("setpoint",), (0, 10), ((1.0,), (float("nan"),)), "not finite"),
+        (("setpoint",), (0, 10), ((1.0,), (1.0, 2.0)), "values"),
+    ],
+)
+def test_a_plan_from_a_message_is_checked_too(names, times, values, word: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(PlanError, match=word):
+        Plan(names, times, values)

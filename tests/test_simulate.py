@@ -1,0 +1,100 @@
+"""`tdof-npid simulate` and the parameter files that it shares with the nodes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tdof_npid_ros.case import load_case
+from tdof_npid_ros.cli import main
+from tdof_npid_ros.parameter_file import read_parameters, write_parameters
+
+
+def simulated(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, object]:
+    assert main(["simulate", *arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)  # type: ignore[no-any-return]
+
+
+def test_json_has_the_keys_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    report = simulated(capsys, "p1-c4", "--controller", "pid", "--gains", "published")
+    assert set(report) == {"case", "controller", "gains", "setpoint", "disturbance", "objective"}
+    assert set(report["gains"]) == {"kp", "ki", "kd", "alpha", "beta", "sigma"}  # type: ignore[arg-type]
+    assert {"overshoot_percent", "settling_time_s", "iae"} <= set(report["setpoint"])  # type: ignore[arg-type]
+    assert {"peak", "recovery_time_s", "iae"} <= set(report["disturbance"])  # type: ignore[arg-type]
+    assert report["objective"] == report["setpoint"]["iae"] + report["disturbance"]["iae"]  # type: ignore[index]
+
+
+def test_single_gains_override(capsys: pytest.CaptureFixture[str]) -> None:
+    report = simulated(capsys, "p1-c4", "--controller", "tdof_npid1", "--kp", "1.25", "--alpha", "0.5")
+    assert (report["gains"]["kp"], report["gains"]["alpha"]) == (1.25, 0.5)  # type: ignore[index]
+
+
+def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "gains.yaml"
+    write_parameters(file, {"controller": {"kp": 1.5, "ki": 0.25, "kd": 2.0}})
+    report = simulated(capsys, "p1-c4", "--controller", "pid", "--gains", str(file))
+    assert report["gains"]["kp"] == 1.5  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nowhere"],
+        ["missing.yaml"],
+        ["p1-c4", "--controller", "fuzzy"],
+        ["p1-c4", "--gains", "missing.yaml"],
+        ["p1-c4", "--kp", "nan"],
+        ["p1-c4", "--sigma", "0"],
+    ],
+)
+def test_bad_input_gets_one_line_and_status_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", *arguments]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert len(printed.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("{", "not YAML"),
+        ("- 1", "node names"),
+        ("plant: 3", "ros__parameters"),
+        ("/**/plant: {ros__parameters: {sample_period: -1}}", "sample_period"),
+        ("/**/plant: {ros__parameters: {sample_period: 1.0e-10}}", "nanoseconds"),
+        ("/**/plant: {ros__parameters: {model: no_such}}", "no_such"),
+        ("/**/controller: {ros__parameters: {kp: high}}", "kp"),
+        ("/**/scenario: {ros__parameters: {episodes: [a]}}", "plan.a"),
+        ("/**/scenario: {ros__parameters: {episodes: [a], plan: {a: [0 speed 1, 1 end]}}}", "line 1 '0 speed 1'"),
+        ("/**/tuner: {ros__parameters: {bounds: {kp: [2, 1]}}}", "bounds.kp"),
+    ],
+)
+def test_a_bad_parameter_file_is_refused_with_its_name(text: str, word: str, tmp_path: Path) -> None:
+    file = tmp_path / "case.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=word) as caught:
+        load_case(file)
+    assert "case.yaml" in str(caught.value)
+
+
+def test_parameters_are_found_for_a_node_in_any_namespace(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {sample_period: 0.1, kp: 1.0}}\n"
+        "loop: {controller: {ros__parameters: {kp: 2.0, nested: {deep: 3}}}}\n"
+        "/other/plant: {ros__parameters: {kp: 9.0}}\n"
+    )
+    assert read_parameters(file, "controller") == {"sample_period": 0.1, "kp": 2.0, "nested.deep": 3}
+
+
+def test_a_plant_of_the_users_own_runs_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "tank.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {sample_period: 0.02}}\n"
+        "/**/plant: {ros__parameters: {model: transfer_function, numerator: [2.0], denominator: [3.0, 1.0]}}\n"
+        "/**/controller: {ros__parameters: {type: pid, kp: 2.0, ki: 1.0}}\n"
+        '/**/scenario: {ros__parameters: {episodes: [setpoint, disturbance], plan: {'
+        'setpoint: ["0 setpoint 1", "30 end"], disturbance: ["0 disturbance 1", "30 end"]}}}\n'
+    )
+    report = simulated(capsys, str(file))
+    assert report["setpoint"]["settling_time_s"] is not None  # type: ignore[index]
