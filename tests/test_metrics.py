@@ -16,7 +16,9 @@ def test_a_second_order_response_has_its_textbook_metrics() -> None:
         np.cos(damped * T) + damping / np.sqrt(1 - damping**2) * np.sin(damped * T)
     )
     metrics = setpoint_metrics(y, 0.0, 1.0, H)
-    assert metrics.overshoot_percent == pytest.approx(100 * np.exp(-np.pi * damping / np.sqrt(1 - damping**2)), abs=0.01)
+    assert metrics.overshoot_percent == pytest.approx(
+        100 * np.exp(-np.pi * damping / np.sqrt(1 - damping**2)), abs=0.01
+    )
     last_outside = T[np.abs(y - 1) > 0.05][-1]
     assert metrics.settling_time_s == pytest.approx(last_outside + H)
 

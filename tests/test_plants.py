@@ -52,7 +52,9 @@ def response(plant: Plant, efforts: np.ndarray, period: float) -> np.ndarray:
         ("transfer_function", {"numerator": [1.0, 2.0], "denominator": [2.0, 0.3, 5.0]}, ([1.0, 2.0], [2.0, 0.3, 5.0])),
     ],
 )
-def test_linear_plants_agree_with_scipys_discretisation(model: str, values: dict[str, object], transfer_function) -> None:  # type: ignore[no-untyped-def]
+def test_linear_plants_agree_with_scipys_discretisation(
+    model: str, values: dict[str, object], transfer_function
+) -> None:  # type: ignore[no-untyped-def]
     u = np.random.default_rng(3).normal(size=300)
     ours = response(make_plant(model, values), u, 0.1)[:-1]
     b, a, _ = signal.cont2discrete(transfer_function, 0.1, method="zoh")

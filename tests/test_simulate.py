@@ -87,13 +87,15 @@ def test_parameters_are_found_for_a_node_in_any_namespace(tmp_path: Path) -> Non
     assert read_parameters(file, "controller") == {"sample_period": 0.1, "kp": 2.0, "nested.deep": 3}
 
 
-def test_a_plant_of_the_users_own_runs_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_plant_of_the_users_own_runs_from_a_parameter_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     file = tmp_path / "tank.yaml"
     file.write_text(
         "/**: {ros__parameters: {sample_period: 0.02}}\n"
         "/**/plant: {ros__parameters: {model: transfer_function, numerator: [2.0], denominator: [3.0, 1.0]}}\n"
         "/**/controller: {ros__parameters: {type: pid, kp: 2.0, ki: 1.0}}\n"
-        '/**/scenario: {ros__parameters: {episodes: [setpoint, disturbance], plan: {'
+        "/**/scenario: {ros__parameters: {episodes: [setpoint, disturbance], plan: {"
         'setpoint: ["0 setpoint 1", "30 end"], disturbance: ["0 disturbance 1", "30 end"]}}}\n'
     )
     report = simulated(capsys, str(file))

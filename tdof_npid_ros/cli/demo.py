@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     picture = bag / "responses.png"
     report.picture(picture)
     if arguments.json:
-        print(json.dumps({"bag": str(bag), "picture": str(picture), "episodes": report.as_dict()["episodes"]}))
+        print(json.dumps({"bag": str(bag), "picture": str(picture), "episodes": report.as_json()["episodes"]}))
     else:
         print(_comparison(report))
         print(f"bag      {bag}\npicture  {picture}")
@@ -93,5 +93,29 @@ _BAR = "{desc} {percentage:3.0f}% |{bar:30}| {n:.0f}/{total:.0f} simulated s [{e
 
 
 def _comparison(report: Any) -> str:
-    """The metrics of each episode beside the published ones."""
-    return str(report.table())
+    """The paper's metrics of each controller's episodes, measured from the bag, beside the published ones."""
+    measured: dict[tuple[str, str], Any] = {
+        (one.episode.controller, one.episode.name): one.metrics() for one in report.episodes
+    }
+    lines = ["", f"{'measured (published)':21}" + "".join(f"{name:>20}" for name in METRICS)]
+    for controller in COMPARED:
+        row = published(CASE, controller)
+        lines.append(f"{controller:21}" + "".join(_cell(measured, controller, row, *METRICS[name]) for name in METRICS))
+    return "\n".join([*lines, *report.notes(), ""])
+
+
+# The paper's name of each metric: the episode it is measured in, its name there and in the published row.
+METRICS = {
+    "M_p (%)": ("setpoint", "overshoot_percent", "overshoot_percent"),
+    "t_s (s)": ("setpoint", "settling_time_s", "settling_time_s"),
+    "IAE_SP": ("setpoint", "iae", "iae_setpoint"),
+    "M_peak": ("disturbance", "peak", "peak"),
+    "t_rcy (s)": ("disturbance", "recovery_time_s", "recovery_time_s"),
+    "IAE_DIS": ("disturbance", "iae", "iae_disturbance"),
+}
+
+
+def _cell(measured: dict[tuple[str, str], Any], controller: str, row: Any, episode: str, ours: str, theirs: str) -> str:
+    value = getattr(measured.get((controller, episode)), ours, None)
+    shown = "-" if value is None else f"{value:.4g}"
+    return f"{f'{shown} ({getattr(row, theirs):.4g})':>20}"

@@ -22,7 +22,7 @@ from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
-from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
+from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study, TuningResult
 
 INTERRUPTED = 130  # exit status, as a shell gives it after Ctrl-C
@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--generations", type=int, help=f"of a whole population each (default: {GENERATIONS})")
     length.add_argument("--budget", type=int, help="evaluations, instead of --generations")
+    parser.add_argument("--polish", type=int, default=POLISH, help=f"candidates a step of the HGA's polish ({POLISH})")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")
@@ -80,7 +81,15 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         generations = arguments.budget // max(arguments.population, 1)
     extra = (arguments.free,) if arguments.free else ()
     return TuningProblem(
-        case, controller, extra, case.weight, arguments.algorithm, arguments.seed, arguments.population, generations
+        case,
+        controller,
+        extra,
+        case.weight,
+        arguments.algorithm,
+        arguments.seed,
+        arguments.population,
+        generations,
+        arguments.polish,
     )
 
 

@@ -1,4 +1,4 @@
-"""The controller: the law with its state, answering each output once.
+"""The controller: the law with its state and its operation, answering each output once.
 
 It knows no ROS. The controller node calls `answer` for each message, `verify` for each message of a bag.
 """
@@ -11,23 +11,31 @@ from functools import lru_cache
 import numpy as np
 
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.law import TERMS, answer_lanes, coefficients
+from tdof_npid_ros.control.law import ALPHA, BETA, KD_H, KI_H, KP, TERMS, answer_lanes, coefficients
+from tdof_npid_ros.control.operation import PLAIN, Operation
+from tdof_npid_ros.control.shaping import EFFORT, OUTPUT, SETPOINT, STATES, shape_lanes, shape_of
+
+(INTEGRAL, FILTER) = range(2)  # rows of the law's state
 
 
 class Controller:
     """A sampled TDOF-NPID controller for one lane or many.
 
+    A change of parameters and a start within a running loop take effect at the next answer. So the answers depend on
+    nothing but the sequence of what was answered with what, and `verify` finds them again.
+
     Attributes:
         effort: the latest answer u, (lanes,).
         terms: of the latest answer, (6, lanes): see `TERMS`.
         stamp_ns: of the output that the latest answer was for; None before the first.
+        gains, operation: the parameters of the next answer.
     """
 
-    def __init__(self, gains: Gains, sample_period_ns: int) -> None:
+    def __init__(self, gains: Gains, sample_period_ns: int, operation: Operation = PLAIN) -> None:
         self.sample_period_ns = sample_period_ns
-        self.gains = gains
+        self._law = _Law(gains, operation, sample_period_ns)
         self._allocate()
-        self.change_gains(gains)
+        self.change(gains, operation)
 
     @property
     def lanes(self) -> int:
@@ -39,20 +47,41 @@ class Controller:
         """The name of the parameters that answers are computed with."""
         return self._digest
 
-    def change_gains(self, gains: Gains) -> None:
-        """Go on with other gains. The state is kept, unless the number of lanes changes."""
-        changed_lanes = gains.lanes != self.gains.lanes
-        self.gains = gains
-        self._digest = parameters_digest(gains, self.sample_period_ns)
-        c, self._limits = coefficients(gains, self.sample_period_ns / 1e9)
-        self._c = c.ravel()
-        if changed_lanes:
+    def change(self, gains: Gains, operation: Operation) -> None:
+        """Go on with other parameters. The state is kept, unless the number of lanes changes.
+
+        Raises:
+            GainsError: the two do not fit together.
+        """
+        operation.check_lanes(gains)
+        self.gains, self.operation = gains, operation
+        self._digest = parameters_digest(gains, self.sample_period_ns, operation)
+        self._settled = False
+        if gains.lanes != self._law.gains.lanes:
+            self._law = _Law(gains, operation, self.sample_period_ns)
             self._allocate()
+
+    def change_gains(self, gains: Gains) -> None:
+        """Go on with other gains, operated as before."""
+        self.change(gains, self.operation)
 
     def reset(self) -> None:
         """Forget the state and the latest answer."""
         self._state[:] = 0.0
         self.stamp_ns = None
+        self._applied = self._integral = None
+        self._settled = False
+
+    def begin_within(self, applied: np.ndarray, integral: np.ndarray | None = None) -> None:
+        """Let the next answer begin within a running loop, without a jump.
+
+        Args:
+            applied: the effort that the plant has now, (lanes,).
+            integral: the integral action to begin with, (lanes,); None: the one with which the answer is `applied`.
+        """
+        self.stamp_ns = None
+        self._applied, self._integral = applied, integral
+        self._settled = False
 
     def answer(self, stamp_ns: int, setpoint: np.ndarray, output: np.ndarray) -> bool:
         """Answer the output of `stamp_ns`; the answer is in `effort` and `terms`.
@@ -67,20 +96,123 @@ class Controller:
         """
         if stamp_ns == self.stamp_ns:
             return False
+        if not self._settled:
+            self._settle(setpoint, output)
         self.stamp_ns = stamp_ns
-        answer_lanes(self._c, self._limits, setpoint, output, self._state, self.effort, self.terms)
+        self._law.answer(setpoint, output, self._state, self._shaping, self.effort, self.terms)
+        self._latest = setpoint, output
         return True
 
     def _allocate(self) -> None:
-        lanes = self.gains.lanes
+        lanes = self._law.gains.lanes
         self.stamp_ns: int | None = None
+        self._applied: np.ndarray | None = None
+        self._integral: np.ndarray | None = None
         self._state = np.zeros((2, lanes))
+        self._shaping = np.zeros((STATES, lanes))
+        self._latest = np.zeros(lanes), np.zeros(lanes)
         self.effort = np.zeros(lanes)
         self.terms = np.zeros((len(TERMS), lanes))
+        self._settled = False
+
+    def _settle(self, setpoint: np.ndarray, output: np.ndarray) -> None:
+        """Before an answer: begin, or take over changed parameters."""
+        before, self._settled = self._law, True
+        if (before.gains, before.operation) != (self.gains, self.operation):
+            self._law = _Law(self.gains, self.operation, self.sample_period_ns)
+        if self.stamp_ns is None:
+            self._begin(setpoint, output)
+        elif self._law is not before:
+            self._take_over(before, setpoint, output)
+
+    def _begin(self, setpoint: np.ndarray, output: np.ndarray) -> None:
+        law, applied = self._law, self._applied
+        self._shaping[SETPOINT] = output if law.shape.setpoint_step < np.inf else setpoint
+        self._shaping[OUTPUT] = output
+        self._shaping[EFFORT] = 0.0 if applied is None else applied
+        if applied is None:
+            return
+        r, y = law.shaped(setpoint, output, self._shaping)
+        self._state[FILTER] = law.derivative_error(r, y)
+        wanted = applied - law.proportional(r, y) if self._integral is None else self._integral
+        self._state[INTEGRAL] = law.integral(wanted, 0.0)
+        self._applied = self._integral = None
+
+    def _take_over(self, before: _Law, setpoint: np.ndarray, output: np.ndarray) -> None:
+        """Give the state of the law before to the one now, so that the effort does not jump."""
+        if before.operation.is_plain:
+            self._shaping[SETPOINT], self._shaping[OUTPUT] = self._latest
+            self._shaping[EFFORT] = self.effort
+        if not self.operation.bumpless:
+            return
+        effort, terms = np.empty_like(self.effort), np.empty_like(self.terms)
+        before.answer(setpoint, output, self._state.copy(), self._shaping.copy(), effort, terms)
+        law, derivative = self._law, terms[TERMS.index("derivative")]
+        r, y = law.shaped(setpoint, output, self._shaping)
+        has_derivative = law.c[KD_H] != 0
+        derivative = np.where(has_derivative, derivative, 0.0)
+        e_d = law.derivative_error(r, y)
+        self._state[FILTER] = e_d - np.divide(derivative, law.c[KD_H], out=np.zeros_like(e_d), where=has_derivative)
+        self._state[INTEGRAL] = law.integral(effort - law.proportional(r, y) - derivative, self._state[INTEGRAL])
+
+
+class _Law:
+    """The law for one set of parameters, without state."""
+
+    def __init__(self, gains: Gains, operation: Operation, sample_period_ns: int) -> None:
+        self.gains, self.operation = gains, operation
+        self.c, self._limits = coefficients(gains, sample_period_ns / 1e9)
+        self.shape = shape_of(operation, gains, sample_period_ns / 1e9)
+        self._flat = self.c.ravel()
+        lanes = gains.lanes
+        self._low, self._high = np.full(lanes, gains.effort_min), np.full(lanes, gains.effort_max)
+        self._shaped = np.empty((2, lanes))
+        self._is_plain = operation.is_plain
+        self._manual = np.broadcast_to(np.asarray(operation.manual_effort, dtype=np.float64), (lanes,))
+
+    def answer(
+        self,
+        setpoint: np.ndarray,
+        output: np.ndarray,
+        state: np.ndarray,
+        shaping: np.ndarray,
+        effort: np.ndarray,
+        terms: np.ndarray,
+    ) -> None:
+        """One answer; state and shaping advance, effort and terms are written."""
+        if self._is_plain:
+            answer_lanes(self._flat, self._limits, self._low, self._high, setpoint, output, state, effort, terms)
+            return
+        shape_lanes(self.shape, setpoint, output, shaping, self._shaped, self._low, self._high)
+        integral = state[INTEGRAL].copy()
+        answer_lanes(self._flat, self._limits, self._low, self._high, *self._shaped, state, effort, terms)
+        if self.operation.manual:
+            state[INTEGRAL] = integral  # the law's is set when it takes over again
+            np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)
+        shaping[EFFORT] = effort
+
+    def shaped(self, setpoint: np.ndarray, output: np.ndarray, shaping: np.ndarray) -> np.ndarray:
+        """Setpoint and output as the law will see them, (2, lanes)."""
+        shaped = np.empty_like(self._shaped)
+        shape_lanes(self.shape, setpoint, output, shaping.copy(), shaped, self._low.copy(), self._high.copy())
+        return shaped
+
+    def proportional(self, r: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """u_p (7)."""
+        return np.asarray(self.c[KP] * ((1.0 - self.c[ALPHA]) * r - y))
+
+    def derivative_error(self, r: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """What the derivative action differentiates; as its filter's state, it makes u_d 0."""
+        return np.asarray((1.0 - self.c[BETA]) * r - y)
+
+    def integral(self, wanted: np.ndarray, otherwise: np.ndarray | float) -> np.ndarray:
+        """The integral action nearest to what is wanted; lanes without integral gain could never leave it again."""
+        within = np.clip(wanted, self.gains.integral_min, self.gains.integral_max)
+        return np.where(self.c[KI_H] != 0, within, otherwise)
 
 
 @lru_cache(maxsize=1024)
-def parameters_digest(gains: Gains, sample_period_ns: int) -> str:
+def parameters_digest(gains: Gains, sample_period_ns: int, operation: Operation = PLAIN) -> str:
     """A name for what answers are computed with: 12 hexadecimal digits made from the values alone."""
-    content = repr((sorted(gains.as_dict().items()), sample_period_ns))
+    content = repr((sorted(gains.as_dict().items()), sorted(operation.as_dict().items()), sample_period_ns))
     return hashlib.sha256(content.encode()).hexdigest()[:12]

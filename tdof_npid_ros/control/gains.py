@@ -60,9 +60,9 @@ class Gains:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in PER_LANE:
-                object.__setattr__(self, field.name, _lanes(field.name, value))
+                object.__setattr__(self, field.name, lanes_of(field.name, value))
             elif field.name not in ("type", "anti_windup"):
-                object.__setattr__(self, field.name, _number(field.name, value))
+                object.__setattr__(self, field.name, number_of(field.name, value))
         self._validate()
 
     def _validate(self) -> None:
@@ -141,7 +141,8 @@ def gains_from_mapping(values: Mapping[str, Any]) -> Gains:
     return Gains(**{name: values[name] for name in GAIN_NAMES if name in values})
 
 
-def _number(name: str, value: Any) -> float:
+def number_of(name: str, value: Any) -> float:
+    """A parameter's value as a number; GainsError if it is none, or nan."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise GainsError(f"{name} is {value!r}: it must be a number")
     if math.isnan(value):
@@ -149,12 +150,13 @@ def _number(name: str, value: Any) -> float:
     return float(value)
 
 
-def _lanes(name: str, value: Any) -> Lanes:
+def lanes_of(name: str, value: Any) -> Lanes:
+    """A parameter's value as one number, or a tuple with one per lane; GainsError if it is neither."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__len__"):
-        return _number(name, value)
+        return number_of(name, value)
     if len(value) == 0:
         raise GainsError(f"{name} is an empty array: give one number, or one per lane")
-    numbers = tuple(_number(name, one) for one in value)
+    numbers = tuple(number_of(name, one) for one in value)
     return numbers if len(numbers) > 1 else numbers[0]
 
 

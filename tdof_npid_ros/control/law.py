@@ -38,9 +38,12 @@ def law(c: Any, limits: Any, r: Any, y: Any, u_i: Any, z: Any) -> Any:
     u = min(max(raw, u_min), u_max)
 
     step = ki_h * zeta  # (2), (5b)
-    windup = conditional * (raw - u) * step > 0.0
-    u_i = u_i + (0.0 if windup else step) + tracking * (u - raw)
-    u_i = min(max(u_i, i_min), i_max)
+    if u != raw:  # anti-windup
+        windup = conditional * (raw - u) * step > 0.0
+        step = (0.0 if windup else step) + tracking * (u - raw)
+    u_i = u_i + step
+    if not i_min <= u_i <= i_max:
+        u_i = min(max(u_i, i_min), i_max)
     z = e_d + phi * (z - e_d)
     return u, u_i, z, raw, zeta, u_p, u_d
 
@@ -54,22 +57,32 @@ def lane_coefficients(c: Any, j: Any, lanes: Any) -> Any:
 
 @entry_point
 def answer_lanes(
-    c: np.ndarray, limits: Limits, r: np.ndarray, y: np.ndarray, state: np.ndarray, u: np.ndarray, terms: np.ndarray
+    c: np.ndarray,
+    limits: Limits,
+    low: np.ndarray,
+    high: np.ndarray,
+    r: np.ndarray,
+    y: np.ndarray,
+    state: np.ndarray,
+    u: np.ndarray,
+    terms: np.ndarray,
 ) -> None:
     """One sample of every lane.
 
     Args:
         c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `coefficients`.
+        low, high: limits of the effort at this sample, in place of those in `limits`, (lanes,).
         r, y: setpoint and output, (lanes,).
         state: integral action and derivative filter's state, (2, lanes); advanced in place.
         u: effort, (lanes,); written.
         terms: error, scaled error, proportional, integral, derivative and unlimited effort, (6, lanes); written.
     """
     lanes = y.shape[0]
+    _, _, i_min, i_max, conditional = limits
     for j in range(lanes):
         u_i = state[0, j]
         u[j], state[0, j], state[1, j], raw, zeta, u_p, u_d = law(
-            lane_coefficients(c, j, lanes), limits, r[j], y[j], u_i, state[1, j]
+            lane_coefficients(c, j, lanes), (low[j], high[j], i_min, i_max, conditional), r[j], y[j], u_i, state[1, j]
         )
         terms[0, j] = r[j] - y[j]
         terms[1, j] = zeta
@@ -88,6 +101,11 @@ def _exp_minus(q: np.ndarray) -> np.ndarray:
     for j in range(q.shape[0]):
         out[j] = exp_minus(q[j])
     return out
+
+
+def exp_minus_of(q: float) -> float:
+    """exp(-q), q >= 0, with the bits of the compiled law."""
+    return float(_exp_minus(np.array([q]))[0])
 
 
 def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -> tuple[np.ndarray, Limits]:

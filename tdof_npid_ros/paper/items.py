@@ -125,7 +125,7 @@ def variation_table(name: str) -> Item:
         note = (
             "From 5 s on, as the paper says, the setpoint response is not over yet in our loop (the effort limit of ±30 "
             "makes the integral wind up), and its rest outweighs the effect of a. 'At rest': a changes at 120 s instead. "
-            "The recovery times are in the section on t_rcy."
+            "The recovery times are with the evidence on Table 9."
         )
         return Table(name, "Table 9: the parameter a changes at 5 s, Sprott circuit", columns, tuple(rows), 2, note)
 

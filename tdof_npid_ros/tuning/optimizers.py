@@ -34,6 +34,7 @@ def make_optimizer(
     seed: int,
     population: int = 40,
     generations: int = 200,
+    polish: int = 6,
 ) -> Optimizer:
     """An optimiser that ends after population * generations evaluations.
 
@@ -41,11 +42,14 @@ def make_optimizer(
         algorithm: one of `ALGORITHMS`. `cmaes` takes the library's own population; for it only the budget counts.
         lower, upper: [d], bounds of the parameters.
         seed: not negative.
+        polish: of the HGA; the others have none.
 
     Raises:
         TuningError: unknown algorithm, or an argument out of its range.
     """
-    return _kind(algorithm)(lower, upper, seed=seed, population=population, generations=generations)
+    kind = _kind(algorithm)
+    options = {"polish": polish} if kind is HGA else {}
+    return kind(lower, upper, seed=seed, population=population, generations=generations, **options)
 
 
 def restore_optimizer(state: dict[str, Any]) -> Optimizer:

@@ -19,6 +19,9 @@ EPISODES = ("setpoint", "disturbance")
 POPULATION, GENERATIONS = 40, 200
 """By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""
 
+POLISH = 6
+"""By default: candidates in each step of the HGA's polish, for the fewest evaluations."""
+
 
 @dataclass(frozen=True)
 class TuningProblem:
@@ -32,6 +35,7 @@ class TuningProblem:
         algorithm: `hga`, `de` or `cmaes`.
         seed: of the optimiser's random numbers.
         population, generations: their product is the budget of evaluations.
+        polish: candidates in each step of the HGA's polish.
 
     Raises:
         TuningError: the case lacks an episode or bounds, or its bounds allow gains that no controller takes.
@@ -45,6 +49,7 @@ class TuningProblem:
     seed: int = 0
     population: int = POPULATION
     generations: int = GENERATIONS
+    polish: int = POLISH
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.weight < math.inf:
@@ -111,4 +116,5 @@ class TuningProblem:
             "seed": self.seed,
             "population": self.population,
             "generations": self.generations,
+            "polish": self.polish,
         }

@@ -144,6 +144,7 @@ class Study:
             seed=problem.seed,
             population=problem.population,
             generations=problem.generations,
+            polish=problem.polish,
         )
 
     def _save(self) -> None:

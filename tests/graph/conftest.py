@@ -44,6 +44,7 @@ class NodeProcess:
         self.node = node
         self._log = log
         self.expected_status: int | None = 0
+        self.stopped = False
         with log.open("w") as stream:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "tdof_npid_ros.graph", node, *arguments],
@@ -60,12 +61,17 @@ class NodeProcess:
     def send(self, signal_number: int) -> None:
         self.process.send_signal(signal_number)
         if signal_number == signal.SIGKILL:
-            self.expected_status = None
+            self.expected_status, self.stopped = None, True
             self.process.wait()
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it has ended though nobody stopped it."""
+        return not self.stopped and self.expected_status == 0 and self.process.poll() is not None
 
     def stop(self, timeout: float = 10.0) -> float:
         """Ctrl-C; returns after how many seconds the process had ended."""
-        began = time.monotonic()
+        began, self.stopped = time.monotonic(), True
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.send_signal(signal.SIGINT)
@@ -162,7 +168,7 @@ class Graph:
         """Spin until the condition holds; its value is returned."""
         end = time.monotonic() + timeout
         while not (value := condition()):
-            if time.monotonic() > end:
+            if time.monotonic() > end or any(process.has_failed for process in self.processes):
                 logs = "\n".join(f"--- {process.node}:\n{process.log}" for process in self.processes)
                 pytest.fail(f"waited {timeout:g} s in vain for {what}\n{logs}\n--- diagnostics: {self.diagnostics}")
             self.spin_once()

@@ -1,0 +1,71 @@
+"""A still picture of episodes: setpoint, output and effort, one column for each kind of episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from tdof_npid_ros.analysis.episodes import Episode
+from tdof_npid_ros.analysis.errors import AnalysisError
+
+MOST_COLUMNS = 6
+MOST_LANES = 4  # of an episode
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000")
+Named = tuple[str, Episode]
+
+
+def grouped(episodes: Sequence[Named]) -> dict[str, list[Named]]:
+    """Episodes by what they are called, so that the same episode of several controllers or bags is one picture."""
+    groups: dict[str, list[Named]] = {}
+    for name, episode in episodes:
+        groups.setdefault(episode.name, []).append((name, episode))
+    return groups
+
+
+def label(name: str, episode: Episode, lane: int, several_bags: bool) -> str:
+    """How a curve is called in a legend."""
+    parts = [episode.controller.replace("_", "-").upper(), name.rpartition(" ")[2]]
+    parts += [f"lane {lane}"] if episode.lanes > 1 else []
+    parts += [Path(episode.bag).name] if several_bags else []
+    return " ".join(part for part in parts if part)
+
+
+def draw(episodes: Sequence[Named], path: Path) -> None:
+    """Write the picture.
+
+    Raises:
+        AnalysisError: the file cannot be written.
+    """
+    groups = list(grouped(episodes).items())[:MOST_COLUMNS]
+    several_bags = len({episode.bag for _, episode in episodes}) > 1
+    figure = Figure(figsize=(1.5 + 5.5 * len(groups), 6.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(groups), sharex="col", squeeze=False)
+    for column, (group, members) in enumerate(groups):
+        above, below = axes[0][column], axes[1][column]
+        drawn: set[bytes] = set()
+        colour = 0
+        for name, episode in members:
+            for lane in range(min(episode.lanes, MOST_LANES)):
+                setpoint = episode.setpoint[:, lane]
+                if setpoint.tobytes() not in drawn:
+                    drawn.add(setpoint.tobytes())
+                    above.plot(episode.time, setpoint, "--", color="0.4", lw=1, label="setpoint", drawstyle="steps-post")
+                style = {"color": _COLOURS[colour % len(_COLOURS)], "lw": 1.3}
+                above.plot(episode.time, episode.output[:, lane], label=label(name, episode, lane, several_bags), **style)
+                below.plot(episode.time, episode.control_effort[:, lane], drawstyle="steps-post", **style)
+                colour += 1
+        above.set_title(group)
+        above.legend(fontsize=8)
+        below.set_xlabel("time (s)")
+        for axis in (above, below):
+            axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("setpoint r, output y")
+    axes[1][0].set_ylabel("control effort u")
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:
+        raise AnalysisError(f"{path} cannot be written: {error}") from None

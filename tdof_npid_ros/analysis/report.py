@@ -1,0 +1,221 @@
+"""What `analyze` tells of bags: metrics of every episode as a table, CSV, JSON, a picture and an HTML page."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tdof_npid_ros.analysis import page, picture
+from tdof_npid_ros.analysis.episodes import Episode, read_episodes_of
+from tdof_npid_ros.analysis.responses import Deviation, EffortUse, Response, deviation, effort_use, responses
+from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
+
+LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
+# Column of the table and of the CSV: title, and how a person reads a value.
+COLUMNS = {
+    "bag": ("bag", "{}"),
+    "episode": ("episode", "{}"),
+    "controller": ("controller", "{}"),
+    "lane": ("lane", "{}"),
+    "response": ("response to", "{}"),
+    "start_s": ("at (s)", "{:g}"),
+    "overshoot_percent": ("M_p (%)", "{:.4f}"),
+    "settling_time_s": ("t_s (s)", "{:.4f}"),
+    "peak": ("M_peak", "{:.4f}"),
+    "recovery_time_s": ("t_rcy (s)", "{:.4f}"),
+    "iae": ("IAE", "{:.4f}"),
+    "iae_change_percent": ("ΔIAE (%)", "{:+.1f}"),
+    "effort_variation": ("Σ|Δu|", "{:.4g}"),
+    "effort_peak": ("max|u|", "{:.4g}"),
+    "saturated_percent": ("at limit (%)", "{:.1f}"),
+    "deviation": ("off simulation", "{:.3g}"),
+}
+
+
+@dataclass(frozen=True)
+class EpisodeReport:
+    """One episode and what it shows.
+
+    Attributes:
+        responses: by lane, in order of time.
+        effort: by lane.
+        deviation: from the in-process simulation.
+    """
+
+    episode: Episode
+    responses: tuple[tuple[Response, ...], ...]
+    effort: tuple[EffortUse, ...]
+    deviation: Deviation
+
+    def metrics(self, lane: int = 0) -> SetpointMetrics | DisturbanceMetrics | None:
+        """The paper's metrics of the lane's first response."""
+        return self.responses[lane][0].metrics
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `analyze` found: the episodes of all bags, in the order of the bags and of time."""
+
+    episodes: tuple[EpisodeReport, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per response, by the names of `COLUMNS`; None where there is no such number."""
+        several_bags = len({report.episode.bag for report in self.episodes}) > 1
+        rows = [row for report in self.episodes for row in _rows(report, several_bags)]
+        first: dict[tuple[Any, ...], float] = {}
+        for row in rows:
+            same = (row["episode"].partition(" #")[0], row["lane"], row["response"], row["start_s"])
+            if row["iae"] is None:
+                continue
+            if same in first and first[same] > 0:
+                row["iae_change_percent"] = 100.0 * (row["iae"] / first[same] - 1.0)
+            first.setdefault(same, row["iae"])
+        return rows
+
+    def table(self) -> str:
+        """The rows as a table for a terminal; columns without a value are left out."""
+        rows = self.rows()
+        shown = [row for row in rows if row["lane"] < LANES_SHOWN]
+        names = [name for name in COLUMNS if any(row[name] not in (None, "") for row in shown)]
+        if all(row["lane"] == 0 for row in rows):
+            names.remove("lane")
+        cells = [[COLUMNS[name][0] for name in names], *([_shown(row, name) for name in names] for row in shown)]
+        widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+        lines.insert(1, "  ".join("─" * width for width in widths))
+        if len(shown) < len(rows):
+            lines.append(f"… {len(rows) - len(shown)} rows of further lanes: --csv or --json has them")
+        return "\n".join([*lines, *self.notes()])
+
+    def notes(self) -> list[str]:
+        """Why numbers are missing, a line for each cause."""
+        causes: dict[str, list[str]] = {}
+        for report in self.episodes:
+            name = title(report.episode)
+            for response in report.responses[0]:
+                if response.reason and response.kind != "tracking":
+                    causes.setdefault(f"response to {response.kind}: {response.reason}", []).append(name)
+            if report.deviation.reason and report.episode.plan is not None:
+                causes.setdefault(f"not compared with the simulation: {report.deviation.reason}", []).append(name)
+        return [f"{', '.join(dict.fromkeys(names))}: {cause}" for cause, names in causes.items()]
+
+    def as_json(self) -> dict[str, Any]:
+        """The whole report as a JSON object; limits that are infinite become null."""
+        document: dict[str, Any] = _finite({"episodes": [_as_json(report) for report in self.episodes]})
+        return document
+
+    def as_csv(self) -> str:
+        """The rows as CSV, numbers in full."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=list(COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows())
+        return text.getvalue()
+
+    def picture(self, path: str | Path) -> None:
+        """Write setpoint, output and effort of every episode to a PNG (or what the suffix says).
+
+        Raises:
+            AnalysisError: the file cannot be written.
+        """
+        picture.draw([(title(report.episode), report.episode) for report in self.episodes], Path(path))
+
+    def html(self, path: str | Path) -> None:
+        """Write one self-contained page with interactive plots.
+
+        Raises:
+            AnalysisError: the file cannot be written.
+        """
+        rows = [[_shown(row, name) for name in COLUMNS] for row in self.rows() if row["lane"] < LANES_SHOWN]
+        titles = [heading for heading, _ in COLUMNS.values()]
+        named = [(title(report.episode), report.episode) for report in self.episodes]
+        page.write(named, [titles, *rows], self.notes(), Path(path))
+
+
+def analyze(paths: Iterable[str | Path]) -> Report:
+    """Every episode of some bags, measured.
+
+    Raises:
+        AnalysisError: there is no output in a bag.
+        BagError: no bag, or it is damaged.
+    """
+    return Report(tuple(_report(episode) for path in paths for episode in read_episodes_of(path)))
+
+
+def title(episode: Episode) -> str:
+    """What a person calls an episode: namespace, plan and number."""
+    return f"{episode.namespace.strip('/')} {episode.name} #{episode.number}".strip()
+
+
+def _report(episode: Episode) -> EpisodeReport:
+    lanes = range(episode.lanes)
+    return EpisodeReport(
+        episode,
+        tuple(tuple(responses(episode, lane)) for lane in lanes),
+        tuple(effort_use(episode, lane) for lane in lanes),
+        deviation(episode),
+    )
+
+
+def _rows(report: EpisodeReport, several_bags: bool) -> list[dict[str, Any]]:
+    episode, off = report.episode, report.deviation
+    rows = []
+    for lane, (found, use) in enumerate(zip(report.responses, report.effort, strict=True)):
+        for response in found:
+            values: dict[str, Any] = dict.fromkeys(COLUMNS)
+            values |= {"bag": Path(episode.bag).name if several_bags else "", "episode": title(episode)}
+            values |= {"controller": episode.controller, "lane": lane, "response": response.kind}
+            values |= {"start_s": response.start_s, "iae": response.iae}
+            metrics = asdict(response.metrics) if response.metrics is not None else {}
+            values |= {name: value for name, value in metrics.items() if name in COLUMNS}
+            values |= {"effort_variation": use.total_variation, "effort_peak": use.peak}
+            if use.saturated_share is not None:
+                values["saturated_percent"] = 100.0 * use.saturated_share
+            if off.output is not None and off.control_effort is not None:
+                values["deviation"] = max(off.output, off.control_effort)
+            rows.append(values)
+    return rows
+
+
+def _shown(row: dict[str, Any], name: str) -> str:
+    return "-" if row[name] is None else COLUMNS[name][1].format(row[name])
+
+
+def _as_json(report: EpisodeReport) -> dict[str, Any]:
+    episode = report.episode
+    return {
+        "bag": episode.bag,
+        "namespace": episode.namespace,
+        "name": episode.name,
+        "number": episode.number,
+        "plan": episode.plan.digest if episode.plan is not None else None,
+        "controller": episode.controller,
+        "gains": [gains.as_dict() for gains in episode.gains],
+        "sample_period_s": episode.sample_period_ns / 1e9,
+        "samples": len(episode.time),
+        "missing": episode.missing,
+        "lanes": [
+            {"responses": [_response_as_json(response) for response in found], "effort": asdict(use)}
+            for found, use in zip(report.responses, report.effort, strict=True)
+        ],
+        "deviation": asdict(report.deviation),
+    }
+
+
+def _response_as_json(response: Response) -> dict[str, Any]:
+    document = asdict(response)
+    return document | (document.pop("metrics") or {})
+
+
+def _finite(value: Any) -> Any:
+    """The value with infinities and NaN as None, which is all that JSON can say."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,248 @@
+"""E2: every control effort of a bag, computed again from what the controller was given, is the recorded one, bit for bit.
+
+The answers are taken in the controller's order, each with the output that it names by stamp and episode, the
+setpoint that it bears, and the parameters whose digest it bears. They go through the same `Stamps` and `Controller`
+as in the controller node.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tdof_npid_ros.analysis.errors import AnalysisError
+from tdof_npid_ros.analysis.parameters import gains_by_digest
+from tdof_npid_ros.analysis.recording import Loop, read_loops
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.law import TERMS
+from tdof_npid_ros.control.stamps import Stamps
+from tdof_npid_ros.scenario import Plan, Signals
+
+# Why an answer cannot be verified.
+NO_PARAMETERS = "the parameters that they bear the digest of are not in the bag"
+NO_OUTPUT = "the outputs that they answer are not in the bag"
+UNKNOWN_STATE = "the controller's state is not known: the bag lacks earlier answers of the episode"
+OTHER_LANES = "their length is not that of the gains"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An answer that is not what its inputs give.
+
+    Attributes:
+        what: `control effort`, or `setpoint` for one that is not the plan's.
+        step: index of the answer in the topic.
+        inputs: what went in, by name, for people.
+        recorded, expected: (lanes,).
+    """
+
+    what: str
+    topic: str
+    step: int
+    stamp_ns: int
+    episode: str
+    inputs: Mapping[str, Any]
+    recorded: tuple[float, ...]
+    expected: tuple[float, ...]
+
+    def lines(self) -> list[str]:
+        """The difference for people, numbers in full."""
+        place = f"{self.topic}, message {self.step}, at {self.stamp_ns / 1e9:.9g} s of {self.episode or 'the recording'}"
+        return [
+            f"first difference: {self.what} in {place}",
+            *(f"  {name:22} {value}" for name, value in self.inputs.items()),
+            f"  {'recorded':22} {_numbers(self.recorded)}",
+            f"  {'expected':22} {_numbers(self.expected)}",
+        ]
+
+
+@dataclass
+class Verification:
+    """The account of one bag.
+
+    Attributes:
+        equal, different: answers that were computed again.
+        unverifiable: answers that could not be, by reason.
+        first: the first difference.
+    """
+
+    bag: str
+    equal: int = 0
+    different: int = 0
+    unverifiable: Counter[str] = field(default_factory=Counter)
+    first: Difference | None = None
+
+    @property
+    def sound(self) -> bool:
+        """Whether something was verified and all of it is equal."""
+        return self.equal > 0 and self.different == 0
+
+    def lines(self) -> list[str]:
+        """The account for people."""
+        found = [f"{self.bag}: {self.equal} control efforts verified bit for bit, {self.different} differ"]
+        found += [f"  {count} not verifiable: {reason}" for reason, count in self.unverifiable.items()]
+        if not self.equal and not self.different:
+            found.append("  nothing was verified")
+        return [*found, *(self.first.lines() if self.first else [])]
+
+
+def verify(path: str | Path) -> Verification:
+    """Compute every control effort of a bag again.
+
+    Raises:
+        AnalysisError: there are no control efforts in it.
+        BagError: no bag, or it is damaged.
+    """
+    with BagReader(path) as reader:
+        loops = [loop for loop in read_loops(reader, str(path)) if loop.control_effort is not None]
+    if not loops:
+        raise AnalysisError(f"{path}: no control efforts in it to verify: record the controller's namespace")
+    account = Verification(str(path))
+    for loop in loops:
+        _Replay(loop, account).run()
+    return account
+
+
+class _Answer(NamedTuple):
+    """One recorded answer, and the output that it answers; `output` is -1 when that is not in the bag."""
+
+    step: int
+    stamp_ns: int
+    digest: str
+    episode: str
+    output: int
+    known_start: bool  # the publisher had published nothing before
+    follows: bool  # no answer is missing between this one and the one before
+
+
+class _Replay:
+    """A controller that is fed from a bag."""
+
+    def __init__(self, loop: Loop, account: Verification) -> None:
+        assert loop.control_effort is not None
+        self._loop = loop
+        self._answers = loop.control_effort
+        self._account = account
+        self._topic = f"{loop.namespace}control_effort"
+        self._gains = gains_by_digest(loop.histories)
+        self._signals: dict[tuple[str, int], Signals] = {}
+        self._controller: Controller | None = None
+        self._stamps = Stamps()
+        self._known = False  # whether the controller's state is that of the recorded one
+        self._first_difference: Difference | None = None
+
+    def run(self) -> None:
+        """Take every answer of the loop, in order."""
+        positions = self._loop.output.position
+        setpoints, efforts = self._answers.position, self._answers.effort
+        for answer in _answers(self._loop):
+            y = positions[answer.output] if answer.output >= 0 else None
+            self._take(answer, y, setpoints[answer.step], efforts[answer.step])
+
+    def _take(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray, u: np.ndarray) -> None:
+        reason = self._prepare(answer, y, r)
+        if reason is not None:
+            self._account.unverifiable[reason] += 1
+            return
+        assert self._controller is not None and y is not None
+        self._controller.answer(answer.stamp_ns, r, y)
+        expected = self._controller.effort
+        if not self._known:
+            self._account.unverifiable[UNKNOWN_STATE] += 1
+        elif expected.tobytes() != u.tobytes():
+            self._differs("control effort", answer, y, r, u, expected)
+        elif (planned := self._planned(answer, len(r))) is not None and planned.tobytes() != r.tobytes():
+            self._differs("setpoint", answer, y, r, r, planned)
+        else:
+            self._account.equal += 1
+
+    def _prepare(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray) -> str | None:
+        """Bring the controller to where the recorded one was before this answer, or say why that cannot be."""
+        configuration = self._gains.get(answer.digest)
+        verdict = self._stamps.take(answer.stamp_ns, answer.episode)
+        fresh = answer.known_start or answer.stamp_ns == 0 or verdict == "restart" and answer.step > 0
+        if answer.known_start or not answer.follows:
+            self._known = False
+        if configuration is None or y is None:
+            self._known = False
+            return NO_PARAMETERS if configuration is None else NO_OUTPUT
+        gains, period_ns = configuration
+        if len(y) != gains.lanes or len(r) != gains.lanes:
+            self._known = False
+            return OTHER_LANES
+        self._configure(answer.digest, gains, period_ns)
+        if verdict == "restart" or answer.known_start:
+            assert self._controller is not None
+            self._controller.reset()
+        self._known = self._known or fresh
+        return None
+
+    def _configure(self, digest: str, gains: Gains, period_ns: int) -> None:
+        if self._controller is None or self._controller.sample_period_ns != period_ns:
+            self._controller = Controller(gains, period_ns)
+        elif self._controller.digest != digest:
+            self._controller.change_gains(gains)
+
+    def _planned(self, answer: _Answer, lanes: int) -> np.ndarray | None:
+        """The plan's setpoint, (lanes,); None where there is no plan."""
+        plan: Plan | None = self._loop.plans.get(answer.episode.partition("/")[0])
+        if plan is None or "/" not in answer.episode:
+            return None
+        return np.full(lanes, plan.value_at("setpoint", answer.stamp_ns))
+
+    def _differs(
+        self, what: str, answer: _Answer, y: np.ndarray, r: np.ndarray, recorded: np.ndarray, expected: np.ndarray
+    ) -> None:
+        self._account.different += 1
+        if self._account.first is not None:
+            return
+        assert self._controller is not None
+        inputs: dict[str, Any] = {"setpoint": _numbers(r), "output": _numbers(y), "parameters": answer.digest}
+        inputs |= self._controller.gains.as_dict()
+        inputs |= {term: _numbers(row) for term, row in zip(TERMS, self._controller.terms, strict=True)}
+        self._account.first = Difference(
+            what,
+            self._topic,
+            answer.step,
+            answer.stamp_ns,
+            answer.episode,
+            inputs,
+            tuple(recorded.tolist()),
+            tuple(expected.tolist()),
+        )
+
+
+def _answers(loop: Loop) -> Iterator[_Answer]:
+    """The recorded answers in order, each with its output: the next one of that stamp and episode."""
+    answers = loop.control_effort
+    assert answers is not None
+    outputs = loop.output
+    frames = outputs.frame_id.tolist()
+    stamps = outputs.stamp_ns.tolist()
+    position = 0
+    before = 0
+    for step, (frame, stamp, sequence) in enumerate(
+        zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)
+    ):
+        digest, _, episode = frame.partition(" ")
+        at = position
+        while at < len(stamps) and not (stamps[at] == stamp and frames[at] == episode):
+            at += 1
+        found = at < len(stamps)
+        if found:
+            position = at + 1
+        yield _Answer(
+            step, stamp, digest, episode, at if found else -1, sequence == 1, not sequence or sequence == before + 1
+        )
+        before = sequence
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(float(value).hex() + f" ({float(value)!r})" for value in values)

@@ -1,0 +1,39 @@
+"""`tdof-npid analyze`: metrics and pictures of the episodes in bags."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from tdof_npid_ros.analysis.report import analyze
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="bag folders, .mcap or .db3 files; several are compared")
+    parser.add_argument("--png", type=Path, metavar="FILE", help="picture of setpoint, output and effort")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="one page with interactive plots, for any browser")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="the table, numbers in full")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the metrics of every episode and write what was asked for."""
+    report = analyze(arguments.bags)
+    written = []
+    if arguments.png:
+        report.picture(arguments.png)
+        written.append(arguments.png)
+    if arguments.html:
+        report.html(arguments.html)
+        written.append(arguments.html)
+    if arguments.csv:
+        arguments.csv.write_text(report.as_csv(), encoding="utf-8")
+        written.append(arguments.csv)
+    if arguments.json:
+        print(json.dumps(report.as_json(), allow_nan=False))
+        return 0
+    print(report.table())
+    for path in written:
+        print(f"written: {path}")
+    return 0

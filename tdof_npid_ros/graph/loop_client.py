@@ -1,0 +1,196 @@
+"""A loop in lockstep as the tuner uses it: one lane per candidate, one episode at a time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_candidates, gains_from_mapping
+from tdof_npid_ros.graph.messages import plan_message, stamp_ns, values
+from tdof_npid_ros.graph.node import LATCHED_QOS, SIGNAL_QOS
+from tdof_npid_ros.graph.remote_node import RemoteNode
+from tdof_npid_ros.loop import Integrals
+from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError
+from tdof_npid_ros.tuning.problem import TuningProblem
+
+ATTEMPTS = 5  # at an episode that something else cuts short
+POLL = 0.1  # s between two looks at an episode's progress
+PLAN_DELAY = 0.02  # s until a plan on its way to the plant is asked for again
+TUNED_PARAMETERS = ("type", *PER_LANE)
+
+
+class WrongCaseError(RuntimeError):
+    """A loop that is not the case that is tuned; the message names the parameter and both values."""
+
+
+class LoopClient:
+    """The plant and the controller of one namespace.
+
+    Args:
+        node: through which everything goes; its executor spins in another thread.
+        namespace: of the loop.
+        problem: what is tuned.
+        answer_timeout: s until a silent loop counts as lost.
+        check: called while waiting; raises to give up.
+    """
+
+    def __init__(
+        self, node: Node, namespace: str, problem: TuningProblem, answer_timeout: float, check: Callable[[], None]
+    ) -> None:
+        self.namespace = namespace
+        self._node = node
+        self._problem = problem
+        self._answer_timeout = answer_timeout
+        self._check = check
+        base = namespace.rstrip("/")
+        self.plant = RemoteNode(node, f"{base}/plant", answer_timeout, check)
+        self.controller = RemoteNode(node, f"{base}/controller", answer_timeout, check)
+        self._outputs: EpisodeOutputs | None = None
+        self._ended = threading.Condition()
+        self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
+        self._output_subscription = node.create_subscription(
+            JointState, f"{base}/output", self._on_output, SIGNAL_QOS, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+
+    def destroy(self) -> None:
+        """Leave the graph."""
+        self._node.destroy_subscription(self._output_subscription)
+        self._node.destroy_publisher(self._plan_publisher)
+        self.plant.destroy()
+        self.controller.destroy()
+
+    # What the tuner asks for
+
+    def check_case(self) -> None:
+        """Make sure that the loop is the case's, but for the gains that are tuned.
+
+        Raises:
+            WrongCaseError: it is not.
+            LoopLostError: no answer.
+        """
+        case = self._problem.case
+        _compare(self.plant, _plant_parameters(case), case.name)
+        fixed = {name: value for name, value in self._problem.base.as_dict().items() if name not in TUNED_PARAMETERS}
+        _compare(self.controller, {"sample_period": case.sample_period, **fixed}, case.name)
+
+    def gains(self) -> Gains:
+        """The controller's gains now. Raises LoopLostError if it does not answer."""
+        return gains_from_mapping(self.controller.parameters(GAIN_NAMES))
+
+    def apply(self, gains: Gains) -> None:
+        """Set the gains, and as many lanes as they are for.
+
+        Raises:
+            TuningError: refused, with the reason.
+            LoopLostError: no answer.
+        """
+        self.plant.set_parameters({"lanes": gains.lanes})
+        self.controller.set_parameters(_tuned(gains))
+
+    def run_episode(self, episode: str, candidates: Array) -> Integrals:
+        """Integrals, (n,), of an episode with one lane for each of the candidates (n, gains).
+
+        Raises:
+            TuningError: the controller refused a gain.
+            WrongCaseError: the loop is not the case's any more.
+            LoopLostError: the loop stopped answering, or something else drives it.
+        """
+        gains = gains_from_candidates(self._problem.base, self._problem.names, candidates)
+        for _ in range(ATTEMPTS):
+            self.apply(gains)
+            outputs = self._play(episode, gains.lanes)
+            if not outputs.cut and self._is_unchanged(gains):
+                return outputs.integrals
+        raise LoopLostError(f"{ATTEMPTS} episodes were cut short or their gains changed: something else drives the loop")
+
+    # An episode
+
+    def _play(self, episode: str, lanes: int) -> EpisodeOutputs:
+        """Run an episode; returns its outputs, complete or cut."""
+        plan = self._problem.case.plans[episode]
+        outputs = EpisodeOutputs(plan.digest, self._problem.case.signals[episode], lanes)
+        self._outputs = outputs
+        try:
+            self._plan_publisher.publish(plan_message(plan, 0))
+            outputs.started(self._restarted_with(plan))
+            self._wait_for_end(outputs)
+        finally:
+            self._outputs = None
+        return outputs
+
+    def _restarted_with(self, plan: Plan) -> int:
+        """The number of the episode that the plant starts anew, once the plan has arrived there."""
+        end = time.monotonic() + self._answer_timeout
+        while time.monotonic() < end:
+            answer = self.plant.call(Trigger, f"{self.plant.name}/reset", Trigger.Request())
+            if answer.success and plan.digest in answer.message:
+                return int(answer.message.split()[1])
+            time.sleep(PLAN_DELAY)
+        raise LoopLostError(f"{self.plant.name} did not take the plan within {self._answer_timeout:g} s")
+
+    def _wait_for_end(self, outputs: EpisodeOutputs) -> None:
+        received, moved = outputs.received, time.monotonic()
+        with self._ended:
+            while not (outputs.complete or outputs.cut):
+                self._ended.wait(POLL)
+                self._check()
+                now = time.monotonic()
+                if outputs.received != received:
+                    received, moved = outputs.received, now
+                elif now - moved > self._answer_timeout:
+                    raise LoopLostError(f"no new output for {self._answer_timeout:g} s, after {received} of an episode")
+
+    def _on_output(self, message: JointState) -> None:
+        outputs = self._outputs
+        if outputs is None:
+            return
+        outputs.take(message.header.frame_id, stamp_ns(message.header.stamp), values(message.position))
+        if outputs.complete or outputs.cut:
+            with self._ended:
+                self._ended.notify()
+
+    def _is_unchanged(self, gains: Gains) -> bool:
+        """Whether the loop still is as it was set up, so that what was measured counts."""
+        self.check_case()
+        return self.controller.parameters(TUNED_PARAMETERS) == _tuned(gains)
+
+
+def _tuned(gains: Gains) -> dict[str, Any]:
+    values = {name: getattr(gains, name) for name in TUNED_PARAMETERS}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+def _plant_parameters(case: Case) -> dict[str, Any]:
+    """What the plant's parameters must be for the loop to be the case's."""
+    effort_min, effort_max = case.effort_limits
+    model = {name: case.plant_values.get(name, value) for name, value in model_parameters(case.model).items()}
+    return {
+        "mode": "lockstep",
+        "model": case.model,
+        "sample_period": case.sample_period,
+        "effort_min": effort_min,
+        "effort_max": effort_max,
+        **model,
+    }
+
+
+def _compare(remote: RemoteNode, wanted: dict[str, Any], case: str) -> None:
+    # One by one where the node lacks a parameter, for then it gives none: another model has other parameters.
+    first = [name for name in ("mode", "model") if name in wanted]
+    for names in (first, [name for name in wanted if name not in first]):
+        found = remote.parameters(names) if names else {}
+        for name, value in found.items():
+            if value != wanted[name]:
+                raise WrongCaseError(f"{remote.name} has {name} {value}, but {case} has {wanted[name]}")

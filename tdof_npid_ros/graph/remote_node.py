@@ -1,0 +1,87 @@
+"""Another node's parameters and services, called from a thread that may block while the executor spins elsewhere."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+
+from tdof_npid_ros.graph.node import plain
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.live import LoopLostError
+
+RESEND = 1.0  # s until a request is sent again; every request here may arrive twice
+
+
+class RemoteNode:
+    """One node of a loop, as its client sees it.
+
+    Args:
+        node: through which the calls go.
+        name: full name of the other node.
+        answer_timeout: s until a silent node counts as lost.
+        check: called while waiting; raises to give up.
+    """
+
+    def __init__(self, node: Node, name: str, answer_timeout: float, check: Callable[[], None]) -> None:
+        self.name = name
+        self._node = node
+        self._answer_timeout = answer_timeout
+        self._check = check
+        self._clients: dict[str, Any] = {}
+
+    def destroy(self) -> None:
+        """Leave the graph."""
+        for client in self._clients.values():
+            self._node.destroy_client(client)
+
+    def parameters(self, names: Sequence[str]) -> dict[str, Any]:
+        """Parameters by name; one that the node does not have is None.
+
+        Raises:
+            LoopLostError: no answer.
+        """
+        values = self.call(GetParameters, f"{self.name}/get_parameters", GetParameters.Request(names=list(names))).values
+        found = {name: plain(parameter_value_to_python(value)) for name, value in zip(names, values)}  # none at all if
+        return {name: found.get(name) for name in names}  # one is unknown
+
+    def set_parameters(self, values: Mapping[str, Any]) -> None:
+        """Set parameters as a whole.
+
+        Raises:
+            TuningError: refused, with the node's reason.
+            LoopLostError: no answer.
+        """
+        request = SetParametersAtomically.Request()
+        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        result = self.call(SetParametersAtomically, f"{self.name}/set_parameters_atomically", request).result
+        if not result.successful:
+            raise TuningError(f"{self.name} refused {', '.join(values)}: {result.reason}")
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """The answer of a service.
+
+        Raises:
+            LoopLostError: no answer.
+        """
+        client = self._clients.get(service)
+        if client is None:
+            client = self._clients[service] = self._node.create_client(kind, service)
+        end = time.monotonic() + self._answer_timeout
+        while time.monotonic() < end:
+            self._check()
+            if not client.service_is_ready():
+                time.sleep(0.02)
+                continue
+            answered = threading.Event()
+            future = client.call_async(request)
+            future.add_done_callback(lambda _, answered=answered: answered.set())
+            if answered.wait(RESEND):
+                return future.result()
+            client.remove_pending_request(future)
+        raise LoopLostError(f"{service} did not answer within {self._answer_timeout:g} s")

@@ -1,0 +1,159 @@
+"""What tuning through a live loop computes: integrals from the outputs that arrive, and which loop runs what.
+
+It knows no ROS. A loop is anything that runs an episode with one lane per candidate and gives their integrals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdof_npid_ros.loop import SOUND_OUTPUT, Integrals
+from tdof_npid_ros.scenario import Signals
+from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.problem import EPISODES
+
+Indices = NDArray[np.intp]
+
+
+class LoopLostError(RuntimeError):
+    """A loop that does not answer, or not as it should; the message says what was waited for."""
+
+
+class LiveLoop(Protocol):
+    """A loop that evaluates candidates."""
+
+    def run_episode(self, episode: str, candidates: Array) -> Integrals:
+        """Integrals, (n,), of an episode with one lane for each of the candidates (n, gains).
+
+        Raises:
+            LoopLostError: the loop stopped answering; nothing of the episode counts.
+        """
+        ...
+
+
+def integrals_of(signals: Signals, output: Array) -> Integrals:
+    """The integrals of an episode from its outputs (steps + 1, lanes): the same bits as `loop.integrals`."""
+    error = np.abs(signals.setpoint[:, None] - output)
+    error[0] *= 0.5
+    error[-1] *= 0.5
+    iae = np.cumsum(error, axis=0)[-1] * (signals.sample_period_ns / 1e9)  # a sum in the order of time
+    sound = np.count_nonzero(np.abs(output) < SOUND_OUTPUT, axis=0)
+    return Integrals(iae, sound / (signals.steps + 1))
+
+
+class EpisodeOutputs:
+    """Collects the outputs of one episode, whose name is `<plan digest>/<number>`.
+
+    Of several episodes of the plan the latest counts: a plan that arrives once more starts it over.
+
+    Attributes:
+        received: how many different outputs of the latest episode have come.
+        cut: the episode cannot become complete any more: another one began, or outputs are missing.
+    """
+
+    def __init__(self, digest: str, signals: Signals, lanes: int) -> None:
+        self._digest, self._signals, self._lanes = digest, signals, lanes
+        self._output = np.empty((signals.steps + 1, lanes))
+        self._seen = bytearray(signals.steps + 1)
+        self._name, self._number = "", 0
+        self._least: float = math.inf
+        self.received = 0
+        self.cut = False
+
+    def started(self, number: int) -> None:
+        """The loop says that the episode has begun, as number `number`: earlier ones do not count."""
+        self._least = number
+
+    @property
+    def complete(self) -> bool:
+        """Whether every output has come, of an episode that counts."""
+        return self.received > self._signals.steps and self._number >= self._least
+
+    @property
+    def integrals(self) -> Integrals:
+        """Of the complete episode."""
+        return integrals_of(self._signals, self._output)
+
+    def take(self, name: str, stamp_ns: int, output: Array) -> None:
+        """Take the output (lanes,) of an episode's name and a stamp."""
+        if name != self._name and not self._changed_to(name, len(output)):
+            return
+        step = stamp_ns // self._signals.sample_period_ns
+        if len(output) != self._lanes or step > self._signals.steps or self._seen[step]:
+            return
+        self._output[step] = output
+        self._seen[step] = 1
+        self.received += 1
+        if step == self._signals.steps and self.received <= step:
+            self.cut = True
+
+    def _changed_to(self, name: str, lanes: int) -> bool:
+        """Whether outputs of the episode `name` are to be taken from now on."""
+        digest, _, number = name.partition("/")
+        if not number.isdigit():
+            return False
+        if digest != self._digest:
+            self.cut = self.cut or int(number) > self._least
+            return False
+        if int(number) <= self._number or lanes != self._lanes:
+            return False
+        self._name, self._number = name, int(number)
+        self._seen = bytearray(self._signals.steps + 1)
+        self.received = 0
+        return True
+
+
+def shares(waiting: Mapping[str, Indices], loops: int) -> list[list[tuple[str, Indices]]]:
+    """What each of `loops` loops is to run: episodes, each with the candidates that still wait for it.
+
+    An episode takes nearly as long with one lane as with many, so loops are given different episodes first, and only
+    then parts of the same one.
+    """
+    given: list[list[tuple[str, Indices]]] = [[] for _ in range(loops)]
+    episodes = [(episode, candidates) for episode, candidates in waiting.items() if candidates.size]
+    for i, (episode, candidates) in enumerate(episodes):
+        takers = list(range(i, loops, len(episodes))) or [i % loops]
+        for taker, part in zip(takers, np.array_split(candidates, len(takers)), strict=True):
+            if part.size:
+                given[taker].append((episode, part))
+    return given
+
+
+def measure(
+    candidates: Array, usable_loops: Callable[[], Sequence[LiveLoop]], lost: Callable[[LiveLoop, LoopLostError], None]
+) -> tuple[Integrals, Integrals]:
+    """Integrals of both episodes for all candidates (n, gains), by all usable loops at once.
+
+    What a loop leaves undone the others do; the outcome does not depend on who does what.
+
+    Args:
+        usable_loops: the loops to use now, at least one; called again when one was lost.
+        lost: told which loop was lost, and why.
+    """
+    results = {episode: Integrals(*np.empty((2, len(candidates)))) for episode in EPISODES}
+    done = {episode: np.zeros(len(candidates), dtype=bool) for episode in EPISODES}
+
+    def work(loop: LiveLoop, share: list[tuple[str, Indices]]) -> None:
+        for episode, part in share:
+            measured = loop.run_episode(episode, candidates[part])
+            results[episode].iae[part], results[episode].sound_share[part] = measured.iae, measured.sound_share
+            done[episode][part] = True
+
+    while not all(finished.all() for finished in done.values()):
+        loops = usable_loops()
+        waiting = {episode: np.flatnonzero(~finished) for episode, finished in done.items()}
+        with ThreadPoolExecutor(len(loops)) as pool:
+            running = [(loop, pool.submit(work, loop, s)) for loop, s in zip(loops, shares(waiting, len(loops)))]
+        for loop, outcome in running:
+            try:
+                outcome.result()
+            except LoopLostError as error:
+                lost(loop, error)
+    setpoint, disturbance = (results[episode] for episode in EPISODES)
+    return setpoint, disturbance

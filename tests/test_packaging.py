@@ -1,0 +1,86 @@
+"""The package installs with colcon as an ament_python package, and a node starts from the installed tree."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+NODES = {"plant", "controller", "scenario", "tuner", "recorder", "replay", "tdof-npid"}
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The prefix of a colcon build of a clone of the package."""
+    colcon = shutil.which("colcon", path=str(Path(sys.executable).parent))
+    if colcon is None:
+        pytest.skip("colcon is not installed beside this Python (pip install -e '.[test]')")
+    workspace = tmp_path_factory.mktemp("workspace")
+    source = workspace / "src" / "tdof_npid_ros"
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, source / name)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    built = subprocess.run([colcon, "build"], cwd=workspace, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return workspace / "install" / "tdof_npid_ros"
+
+
+def test_colcon_installs_what_ros2_run_and_launch_look_for(installed: Path) -> None:
+    assert {path.name for path in (installed / "lib" / "tdof_npid_ros").iterdir()} == NODES
+    share = installed / "share"
+    assert (share / "ament_index" / "resource_index" / "packages" / "tdof_npid_ros").is_file()
+    assert (share / "tdof_npid_ros" / "package.xml").is_file()
+    assert (share / "tdof_npid_ros" / "launch" / "demo.launch.py").is_file()
+    assert len(list((share / "tdof_npid_ros" / "config").glob("*.yaml"))) >= 7
+
+
+def test_a_node_starts_from_the_installed_tree(installed: Path) -> None:
+    site = next((installed / "lib").glob("python*/site-packages"))
+    environment = {name: value for name, value in os.environ.items() if name != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+    environment |= {
+        "PYTHONPATH": str(site),
+        "PYTHONUNBUFFERED": "1",
+        "ROS_DOMAIN_ID": "88",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    parameters = installed / "share" / "tdof_npid_ros" / "config" / "p1-c0.5.yaml"
+    command = [sys.executable, str(installed / "lib" / "tdof_npid_ros" / "recorder")]
+    bag = installed.parent / "bag"
+    node = subprocess.Popen(
+        [*command, "--ros-args", "--params-file", str(parameters), "-p", f"bag:={bag}"],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=installed,
+    )  # fmt: skip
+    try:
+        assert node.stdout is not None
+        first = node.stdout.readline()
+        assert "recording to" in first, first + node.stdout.read()
+        node.send_signal(signal.SIGINT)
+        assert node.wait(20) == 0
+    finally:
+        node.kill()
+
+
+def test_the_program_finds_the_cases_of_an_installed_tree(installed: Path) -> None:
+    site = next((installed / "lib").glob("python*/site-packages"))
+    done = subprocess.run(
+        [sys.executable, str(installed / "lib" / "tdof_npid_ros" / "tdof-npid"), "simulate", "p1-c4", "--json"],
+        env={**os.environ, "PYTHONPATH": str(site)}, capture_output=True, text=True, cwd=installed,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert '"case": "p1-c4"' in done.stdout
+
+
+def test_pip_installs_ros_only_when_asked() -> None:
+    text = (ROOT / "setup.py").read_text()
+    required = text[text.index("install_requires") : text.index("extras_require")]
+    assert "ros-jazzy" not in required
