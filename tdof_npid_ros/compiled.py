@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.extending import overload
+from numba import types
+from numba.extending import intrinsic, overload
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,6 +33,13 @@ _SOURCES = (
 def compiled(function: F) -> F:
     """Compile a function into the compiled functions that call it."""
     return cast(F, numba.njit(error_model="numpy", nogil=True, forceinline=True)(function))
+
+
+@intrinsic
+def fused_multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c, rounded once. Written out where it is wanted, so that every processor gives the same bits."""
+    signature = types.float64(types.float64, types.float64, types.float64)
+    return signature, lambda context, builder, sig, arguments: builder.fma(*arguments)
 
 
 def implementation_of(stub: Callable[..., Any]) -> Callable[[F], F]:

@@ -136,7 +136,7 @@ def _run_block_of(
         if ring is None:
             ring = np.zeros((sampled.delay + 2, width))
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
-        arguments = (sampled, initial, signals.setpoint, signals.disturbance, segment.first, last,
+        arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,
                      gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip
         if width == 1:
             _run_lane(*arguments)
@@ -146,18 +146,11 @@ def _run_block_of(
 
 
 @compiled
-def closed_step(
-    plant: Any, x: Any, u_i: Any, z: Any, c: Any, gain_limits: Any, limits: Any, r: Any, d: Any, v_old: Any, v_due: Any
-) -> Any:
-    """One step of one lane: y, u and the plant's input v, then the state after it.
-
-    v_old, v_due: the plant's input `delay + 1` and `delay` samples ago (without delay, v itself is due).
-    """
+def answered(plant: Any, x: Any, u_i: Any, z: Any, c: Any, gain_limits: Any, limits: Any, r: Any, d: Any) -> Any:
+    """The first half of a step of one lane: y, u and the plant's input v, then the controller's state after it."""
     y = plant_output(plant, x)
     u, u_i, z, _, _, _, _ = law(c, gain_limits, r, y, u_i, z)
-    v = plant_input(plant, applied(u, limits), d)
-    x = advance_bounded(plant, x, v_old, v if plant.delay == 0 else v_due, d)
-    return y, u, v, x, u_i, z
+    return y, u, plant_input(plant, applied(u, limits), d), u_i, z
 
 
 @entry_point
@@ -166,6 +159,7 @@ def _run_lane(
     x: Any,
     setpoint: Any,
     disturbance: Any,
+    weight: Any,
     first: Any,
     last: Any,
     gain_limits: Any,
@@ -176,21 +170,20 @@ def _run_lane(
     u_out: Any,
 ) -> Any:
     """Steps first to last - 1 of one lane; arrays are flat."""
-    end = setpoint.shape[0] - 1
     size = np.uint64(plant.delay + 2)
     new = np.uint64(first) % size
     c = lane_coefficients(rows, 0, 1)
     x = loaded(x, rows, _X, 1)
     u_i, z, error_sum, sound_outputs = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND]
-    for k in range(first, last):
-        r = setpoint[k]
+    for k in range(np.uint64(first), np.uint64(last)):
+        r, d = setpoint[k], disturbance[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        y, u, ring[new], x, u_i, z = closed_step(
-            plant, x, u_i, z, c, gain_limits, limits, r, disturbance[k], ring[oldest], ring[due]
-        )
-        error_sum += (0.5 if k == 0 or k == end else 1.0) * abs(r - y)
-        sound_outputs += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
+        y, u, ring[new], u_i, z = answered(plant, x, u_i, z, c, gain_limits, limits, r, d)
+        x = advance_bounded(plant, x, ring[oldest], ring[due], d)
+        error_sum += weight[k] * abs(r - y)
+        if abs(y) < SOUND_OUTPUT:
+            sound_outputs += 1.0
         if y_out.shape[0]:
             y_out[k] = y
             u_out[k] = u
@@ -205,6 +198,7 @@ def _run_block(
     x: Any,
     setpoint: Any,
     disturbance: Any,
+    weight: Any,
     first: Any,
     last: Any,
     gain_limits: Any,
@@ -221,13 +215,11 @@ def _run_block(
     tuple, which is part of its type, and the loop over the lanes touches one array only.
     """
     w = len(lanes)
-    end = setpoint.shape[0] - 1
     size = np.uint64(plant.delay + 2)
     new = np.uint64(first) % size
     for k in range(first, last):
         r = setpoint[k]
         d = disturbance[k]
-        weight = 0.5 if k == 0 or k == end else 1.0
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
         for j in range(w):
@@ -236,12 +228,14 @@ def _run_block(
         for j in range(w):
             x = loaded(x, rows, _X * w + j, w)
             c = lane_coefficients(rows, j, w)
-            y, u, rows[_V * w + j], x, rows[_U_I * w + j], rows[_Z * w + j] = closed_step(
-                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, gain_limits, limits, r, d,
-                rows[_V_OLD * w + j], rows[_V_DUE * w + j],
-            )  # fmt: skip
+            y, u, v, rows[_U_I * w + j], rows[_Z * w + j] = answered(
+                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, gain_limits, limits, r, d
+            )
+            v_due = v if plant.delay == 0 else rows[_V_DUE * w + j]
+            x = advance_bounded(plant, x, rows[_V_OLD * w + j], v_due, d)
+            rows[_V * w + j] = v
             store(x, rows, _X * w + j, w)
-            rows[_ERROR_SUM * w + j] += weight * abs(r - y)
+            rows[_ERROR_SUM * w + j] += weight[k] * abs(r - y)
             rows[_SOUND * w + j] += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
             rows[_Y * w + j] = y
             rows[_U * w + j] = u

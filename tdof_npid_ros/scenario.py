@@ -64,6 +64,13 @@ class Signals:
         """Time of each sample in s, (steps + 1,)."""
         return np.arange(self.steps + 1) * (self.sample_period_ns / 1e9)
 
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Weight of each sample in an integral by the trapezoidal rule, in sample periods, (steps + 1,)."""
+        weight = np.ones(self.steps + 1)
+        weight[[0, -1]] = 0.5
+        return weight
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -167,7 +167,7 @@ class _Replay:
         """Bring the controller to where the recorded one was before this answer, or say why that cannot be."""
         configuration = self._gains.get(answer.digest)
         verdict = self._stamps.take(answer.stamp_ns, answer.episode)
-        fresh = answer.known_start or answer.stamp_ns == 0 or verdict == "restart" and answer.step > 0
+        fresh = answer.known_start or answer.stamp_ns == 0 or (verdict == "restart" and answer.step > 0)
         if answer.known_start or not answer.follows:
             self._known = False
         if configuration is None or y is None:

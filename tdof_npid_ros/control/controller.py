@@ -33,6 +33,10 @@ class Controller:
 
     def __init__(self, gains: Gains, sample_period_ns: int, operation: Operation = PLAIN) -> None:
         self.sample_period_ns = sample_period_ns
+        self.stamp_ns: int | None = None
+        self._applied: np.ndarray | None = None
+        self._integral: np.ndarray | None = None
+        operation.check_lanes(gains)
         self._law = _Law(gains, operation, sample_period_ns)
         self._allocate()
         self.change(gains, operation)
@@ -105,14 +109,12 @@ class Controller:
 
     def _allocate(self) -> None:
         lanes = self._law.gains.lanes
-        self.stamp_ns: int | None = None
-        self._applied: np.ndarray | None = None
-        self._integral: np.ndarray | None = None
+        self.stamp_ns = self._applied = self._integral = None
         self._state = np.zeros((2, lanes))
         self._shaping = np.zeros((STATES, lanes))
         self._latest = np.zeros(lanes), np.zeros(lanes)
-        self.effort = np.zeros(lanes)
-        self.terms = np.zeros((len(TERMS), lanes))
+        self.effort: np.ndarray = np.zeros(lanes)
+        self.terms: np.ndarray = np.zeros((len(TERMS), lanes))
         self._settled = False
 
     def _settle(self, setpoint: np.ndarray, output: np.ndarray) -> None:
@@ -185,7 +187,8 @@ class _Law:
             return
         shape_lanes(self.shape, setpoint, output, shaping, self._shaped, self._low, self._high)
         integral = state[INTEGRAL].copy()
-        answer_lanes(self._flat, self._limits, self._low, self._high, *self._shaped, state, effort, terms)
+        r, y = self._shaped
+        answer_lanes(self._flat, self._limits, self._low, self._high, r, y, state, effort, terms)
         if self.operation.manual:
             state[INTEGRAL] = integral  # the law's is set when it takes over again
             np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)

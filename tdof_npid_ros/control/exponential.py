@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tdof_npid_ros.compiled import compiled
+from tdof_npid_ros.compiled import fused_multiply_add as fma
 
 _LOG2_E = 1.4426950408889634
 _LN2_HIGH = 0.693147180369123816490  # the upper bits of ln 2, so that n * _LN2_HIGH is exact for |n| < 2048
@@ -24,15 +25,17 @@ def exp_minus(q: float) -> float:
     2**n * exp(f) with f = -q - n ln 2, |f| <= ln(2)/2, by the Taylor polynomial of degree 13 in Estrin's order.
     """
     q = min(q, _LARGEST)
-    shifted = _ROUND - q * _LOG2_E
+    shifted = fma(q, -_LOG2_E, _ROUND)
     n = shifted - _ROUND
-    f = (-q - n * _LN2_HIGH) - n * _LN2_LOW
+    f = fma(n, -_LN2_LOW, fma(n, -_LN2_HIGH, -q))
     f2 = f * f
     f4 = f2 * f2
-    low = ((1.0 + f) + f2 * (0.5 + f * (1 / 6))) + f4 * ((1 / 24 + f * (1 / 120)) + f2 * (1 / 720 + f * (1 / 5040)))
-    high = ((1 / 40320 + f * (1 / 362880)) + f2 * (1 / 3628800 + f * (1 / 39916800))) + f4 * (
-        1 / 479001600 + f * (1 / 6227020800)
+    low = fma(f4, fma(f2, fma(f, 1 / 5040, 1 / 720), fma(f, 1 / 120, 1 / 24)), fma(f2, fma(f, 1 / 6, 0.5), 1.0 + f))
+    high = fma(
+        f4,
+        fma(f, 1 / 6227020800, 1 / 479001600),
+        fma(f2, fma(f, 1 / 39916800, 1 / 3628800), fma(f, 1 / 362880, 1 / 40320)),
     )
-    mantissa = low + (f4 * f4) * high
+    mantissa = fma(f4 * f4, high, low)
     exponent = np.float64(shifted).view(np.int64) << 52
     return np.int64(np.float64(mantissa).view(np.int64) + exponent).view(np.float64)

@@ -41,9 +41,7 @@ def law(c: Any, limits: Any, r: Any, y: Any, u_i: Any, z: Any) -> Any:
     if u != raw:  # anti-windup
         windup = conditional * (raw - u) * step > 0.0
         step = (0.0 if windup else step) + tracking * (u - raw)
-    u_i = u_i + step
-    if not i_min <= u_i <= i_max:
-        u_i = min(max(u_i, i_min), i_max)
+    u_i = min(max(u_i + step, i_min), i_max)
     z = e_d + phi * (z - e_d)
     return u, u_i, z, raw, zeta, u_p, u_d
 

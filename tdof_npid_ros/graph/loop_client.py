@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -31,7 +30,7 @@ PLAN_DELAY = 0.02  # s until a plan on its way to the plant is asked for again
 TUNED_PARAMETERS = ("type", *PER_LANE)
 
 
-class WrongCaseError(RuntimeError):
+class WrongCaseError(LoopLostError):
     """A loop that is not the case that is tuned; the message names the parameter and both values."""
 
 
@@ -60,9 +59,7 @@ class LoopClient:
         self._outputs: EpisodeOutputs | None = None
         self._ended = threading.Condition()
         self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
-        self._output_subscription = node.create_subscription(
-            JointState, f"{base}/output", self._on_output, SIGNAL_QOS, callback_group=MutuallyExclusiveCallbackGroup()
-        )
+        self._output_subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
 
     def destroy(self) -> None:
         """Leave the graph."""
@@ -97,7 +94,7 @@ class LoopClient:
             LoopLostError: no answer.
         """
         self.plant.set_parameters({"lanes": gains.lanes})
-        self.controller.set_parameters(_tuned(gains))
+        self.controller.set_parameters(tuned_parameters(gains))
 
     def run_episode(self, episode: str, candidates: Array) -> Integrals:
         """Integrals, (n,), of an episode with one lane for each of the candidates (n, gains).
@@ -113,7 +110,9 @@ class LoopClient:
             outputs = self._play(episode, gains.lanes)
             if not outputs.cut and self._is_unchanged(gains):
                 return outputs.integrals
-        raise LoopLostError(f"{ATTEMPTS} episodes were cut short or their gains changed: something else drives the loop")
+        raise LoopLostError(
+            f"{ATTEMPTS} episodes were cut short or their gains changed: something else drives the loop"
+        )
 
     # An episode
 
@@ -164,10 +163,11 @@ class LoopClient:
     def _is_unchanged(self, gains: Gains) -> bool:
         """Whether the loop still is as it was set up, so that what was measured counts."""
         self.check_case()
-        return self.controller.parameters(TUNED_PARAMETERS) == _tuned(gains)
+        return self.controller.parameters(TUNED_PARAMETERS) == tuned_parameters(gains)
 
 
-def _tuned(gains: Gains) -> dict[str, Any]:
+def tuned_parameters(gains: Gains) -> dict[str, Any]:
+    """The controller's parameters that tuning changes."""
     values = {name: getattr(gains, name) for name in TUNED_PARAMETERS}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
@@ -187,7 +187,7 @@ def _plant_parameters(case: Case) -> dict[str, Any]:
 
 
 def _compare(remote: RemoteNode, wanted: dict[str, Any], case: str) -> None:
-    # One by one where the node lacks a parameter, for then it gives none: another model has other parameters.
+    # Another model has other parameters, and a node gives none if it lacks one: so these first.
     first = [name for name in ("mode", "model") if name in wanted]
     for names in (first, [name for name in wanted if name not in first]):
         found = remote.parameters(names) if names else {}

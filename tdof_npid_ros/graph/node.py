@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,17 +13,22 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 
+from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
+from tdof_npid_ros.graph.timing import collect_garbage
 
-SIGNAL_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+SIGNAL_QOS = signal_qos(1000)
+NEWEST_QOS = signal_qos(1)  # of subscriptions for which only the newest message counts
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
-SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core and ignores SIGINT)
+SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
 
@@ -30,7 +37,7 @@ class LoopNode(LifecycleNode):
     """A managed node of the loop.
 
     Subclasses declare their parameters in `__init__`, check changes in `checked` and take them over in `changed`,
-    and create what they publish and subscribe in `activate`.
+    and create what they publish and subscribe in `activate`. What `activate` has created is destroyed on deactivation.
     """
 
     uses_events_executor = True
@@ -38,13 +45,16 @@ class LoopNode(LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.counts: Counter[str] = Counter()
+        self.quiet_parameters: set[str] = set()  # changes of them are not logged: they come from a topic
+        self.active = False
+        self.activation_error: Exception | None = None
+        self.endpoints = Endpoints(self, self.refuse)
         self._warned: set[str] = set()
-        self._declaring = True
         self.autostart = bool(
             self.declare_value("autostart", True, "activate at once; false: wait for a supervisor's transitions")
         )
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer)
 
     # What a subclass fills in
 
@@ -52,7 +62,7 @@ class LoopNode(LifecycleNode):
         """Create publishers, subscriptions, services and timers, and begin to work."""
 
     def deactivate(self) -> None:
-        """Stop working and destroy what `activate` created."""
+        """Stop working, before what `activate` created is destroyed."""
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Check a set of parameter changes as a whole; raise ValueError, with the reason, to refuse it."""
@@ -63,6 +73,22 @@ class LoopNode(LifecycleNode):
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Level, one line for an operator, and facts, for the diagnostics."""
         return OK, "", {}
+
+    # Topics
+
+    def publisher_of(
+        self, message_type: Any, topic: str, qos: QoSProfile, matched: Callable[[Any], None] | None = None
+    ) -> Any:
+        """A publisher that reports missed deadlines and profiles that do not fit."""
+        events = self.endpoints.publisher_events(topic, qos, matched)
+        return self.create_publisher(message_type, topic, qos, event_callbacks=events)
+
+    def subscribe(
+        self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile, sole: bool = False
+    ) -> None:
+        """A subscription that reports profiles that do not fit and, if one publisher is expected, a second one."""
+        events = self.endpoints.subscription_events(topic, qos, sole)
+        self.create_subscription(message_type, topic, callback, qos, event_callbacks=events)
 
     # Parameters
 
@@ -94,7 +120,8 @@ class LoopNode(LifecycleNode):
     def _on_parameters_set(self, parameters: list[Parameter]) -> None:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         for name, value in changes.items():
-            self.get_logger().info(f"{name}: {self._before.get(name)} -> {value}")
+            if name not in self.quiet_parameters:
+                self.get_logger().info(f"{name}: {self._before.get(name)} -> {value}")
         self.changed(changes)
 
     # Reporting
@@ -108,22 +135,54 @@ class LoopNode(LifecycleNode):
 
     def publish_diagnostics(self) -> None:
         """Publish the node's state and counts now; it happens once a second anyway."""
-        level, text, facts = self.state()
+        level, text, facts = self.state() if self.active else (WARN, "inactive: waits for its activation", {})
+        if self.endpoints.conflicts:
+            level, text = max(level, WARN), "; ".join([text, *self.endpoints.conflicts])
         stamp = self.get_clock().now().to_msg()
         name = self.get_fully_qualified_name()
         self._diagnostics_publisher.publish(diagnostics_message(stamp, name, level, text, {**facts, **self.counts}))
+
+    def _on_diagnostics_timer(self) -> None:
+        self.endpoints.look()
+        self.publish_diagnostics()
+        collect_garbage()
 
     # Life cycle
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
-        self.activate()
+        self._lasting = [id(entity) for _, entity in self._entities()]
+        try:
+            self.activate()
+        except (ValueError, OSError, RuntimeError) as error:
+            self.activation_error = error
+            self.get_logger().error(f"not activated: {error}")
+            self._destroy_what_activate_created()
+            return TransitionCallbackReturn.FAILURE
+        self.active = True
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop working."""
+        self.active = False
         self.deactivate()
+        self._destroy_what_activate_created()
         return super().on_deactivate(state)
+
+    def _entities(self) -> list[tuple[Callable[[Any], bool], Any]]:
+        return [
+            *((self.destroy_publisher, publisher) for publisher in self.publishers),
+            *((self.destroy_subscription, subscription) for subscription in self.subscriptions),
+            *((self.destroy_service, service) for service in self.services),
+            *((self.destroy_client, client) for client in self.clients),
+            *((self.destroy_timer, timer) for timer in self.timers),
+        ]
+
+    def _destroy_what_activate_created(self) -> None:
+        for destroy, entity in self._entities():
+            if id(entity) not in self._lasting:
+                destroy(entity)
+        self.endpoints.forget()
 
 
 def plain(value: Any) -> Any:
@@ -144,36 +203,59 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
 
 def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = None) -> None:
     """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
-    rclpy.init(args=arguments)
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # before any thread is made: `_Stop` alone takes them
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    stop = _Stop()
     status, node = 0, None
     try:
         node = make_node()
         if node.autostart:
             node.trigger_configure()
             node.trigger_activate()
-        spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (ValueError, OSError) as error:
+            if node.activation_error is not None:
+                raise node.activation_error
+        spin(node, stop)
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
         status = 2
     finally:
         if node is not None:
-            node.deactivate()
+            if node.active:
+                node.deactivate()
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(status)
 
 
-def spin(node: LoopNode) -> None:
-    """Serve a node until the context is shut down."""
-    executor = _fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
+class _Stop:
+    """Waits for a signal to stop, beside the node, so that the node ends between two callbacks and in order."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._wake: Callable[[], None] | None = None
+        threading.Thread(target=self._wait, daemon=True).start()
+
+    def _wait(self) -> None:
+        signal.sigwait(STOP_SIGNALS)
+        self.requested = True
+        if self._wake is not None:
+            self._wake()
+
+    def wakes(self, executor: Any) -> None:
+        """Wake this executor when the signal comes."""
+        self._wake = executor.wake
+
+
+def spin(node: LoopNode, stop: _Stop) -> None:
+    """Serve a node until it is to stop."""
+    executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
     executor.add_node(node)
-    while rclpy.ok():
+    stop.wakes(executor)
+    while rclpy.ok() and not stop.requested:
         executor.spin_once(timeout_sec=SPIN_TIMEOUT)
 
 
-def _fastest_executor() -> Any:
+def fastest_executor() -> Any:
     try:
         from rclpy.experimental import EventsExecutor  # in Jazzy since 2025, and two to three times as fast
     except ImportError:

@@ -2,98 +2,230 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
+import threading
 import time
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.serialization import serialize_message
-from rclpy.subscription import Subscription
 
-from tdof_npid_ros.bag import schema
+from tdof_npid_ros.bag import BagError, schema
 from tdof_npid_ros.bag.cdr import without_padding
+from tdof_npid_ros.bag.file_writer import COMPRESSIONS
 from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
-from tdof_npid_ros.graph.node import OK, LoopNode, run_node
+from tdof_npid_ros.graph.node import ERROR, OK, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
+from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
 
-ALWAYS = ("/parameter_events", "/rosout", "/diagnostics", "/clock")
-DISCOVERY_PERIOD = 0.1  # s
-DEPTH = 10_000  # messages that may wait for the recorder
+DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
+CALM_LOOKS = 20  # looks without a change, after which there is one a second
+PARAMETER_EVENTS = "/parameter_events"
+EVERYTHING = ["*", PARAMETER_EVENTS, "/rosout", "/diagnostics", "/clock"]
+# The loop's own topics are subscribed before their publishers come, so that not even the first message is missed.
+EXPECTED = {
+    "output": "sensor_msgs/msg/JointState",
+    "control_effort": "sensor_msgs/msg/JointState",
+    "setpoint": "sensor_msgs/msg/JointState",
+    "disturbance": "sensor_msgs/msg/JointState",
+    "controller_state": "sensor_msgs/msg/JointState",
+    "scenario_plan": "trajectory_msgs/msg/JointTrajectory",
+}
 
 
 class RecorderNode(LoopNode):
     """Subscribes raw to the topics of its namespace, also those that appear later, and writes what arrives."""
 
-    uses_events_executor = False  # it fails on callbacks that take the message's times
+    uses_events_executor = False  # it knows no callback groups, and taps must be left alone
 
     def __init__(self) -> None:
         super().__init__("recorder")
         default = f"bags/{time.strftime('%Y%m%d-%H%M%S')}"
         self.folder = Path(str(self.declare_value("bag", default, "folder of the bag; must not exist", fixed=True)))
-        self.compression = self.declare_value("compression", "zstd", "of the chunks: zstd, lz4 or none", fixed=True)
+        self.compression = self.declare_value(
+            "compression", "zstd", f"of the chunks: {', '.join(COMPRESSIONS)}", fixed=True
+        )
+        self.max_bytes = self.declare_value("max_bytes", 0, "a new file begins at this size; 0: never", fixed=True)
+        self.max_duration = number(
+            "max_duration",
+            self.declare_value("max_duration", 0.0, "s; a new file begins after this time; 0: never", fixed=True),
+            low=0.0,
+        )
+        self.topics = self.declare_value(
+            "topics",
+            EVERYTHING,
+            "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace",
+            fixed=True,
+        )
+        self.exclude = self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True)
         self.accept_changes()
-        self.writer: BagWriter | None = None
-        self.recorded: dict[str, Subscription] = {}
+        self.failure = ""
+        self.taps: dict[str, Tap] = {}
+        self.writer = self._open() if self.autostart else None
 
     def activate(self) -> None:
-        self.writer = BagWriter(self.folder, compression=self.compression)
+        self.writer = self.writer or self._open()
+        self.lock = threading.Lock()  # of taps, which the thread looks at
         self.snapshots = ParameterSnapshots(self, self._write_snapshot)
+        self.looks = self.calm_looks = 0
+        for name, kind in EXPECTED.items():
+            topic = self.resolve_topic_name(name)
+            if self._wanted(topic):
+                self._tap(topic, kind, _expected_qos(name))
+        self.thread = TapThread(self._current_taps, self._write)
         self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover)
         self.get_logger().info(f"recording to {self.folder}")
-        self._discover()
+        self._look()
 
     def deactivate(self) -> None:
         if self.writer is not None:
-            writer, self.writer = self.writer, None
             self.discovery.cancel()
-            writer.close()
-            print(f"bag {self.folder}: {self.counts['recorded']} messages", flush=True)
+            self.thread.stop()
+            writer, self.writer = self.writer, None
+            writer.custom_data.update(self._account())
+            try:
+                writer.write_metadata("recording", self._account())
+                writer.close()
+            except BagError as error:
+                self.failure = self.failure or str(error)
+            self._let_go()
+            print(f"bag {self.folder}: {self.counts['recorded']} messages, {self.lost} lost", flush=True)
+
+    # What there is to record
 
     def _discover(self) -> None:
-        namespace = self.get_namespace().rstrip("/") + "/"
+        self.looks += 1
+        if self.calm_looks < CALM_LOOKS or self.looks % round(1 / DISCOVERY_PERIOD) == 0:
+            self._look()
+
+    def _look(self) -> None:
+        before = len(self.taps)
         for topic, types in self.get_topic_names_and_types():
-            wanted = topic.startswith(namespace) or topic in ALWAYS
-            if wanted and topic not in self.recorded and len(types) == 1:
-                self._record(topic, types[0])
+            if self._wanted(topic) and len(types) == 1:
+                self._follow(topic, types[0])
         self.snapshots.look()
+        self.calm_looks = self.calm_looks + 1 if len(self.taps) == before else 0
 
-    def _record(self, topic: str, type_name: str) -> None:
-        assert self.writer is not None
+    def _wanted(self, topic: str) -> bool:
+        namespace = self.get_namespace().rstrip("/") + "/"
+
+        def among(patterns: list[str]) -> bool:
+            return any(fnmatchcase(topic, p if p.startswith("/") else namespace + p) for p in patterns if p)
+
+        return among(self.topics) and not among(self.exclude)
+
+    def _follow(self, topic: str, type_name: str) -> None:
+        """Subscribe to a topic, or again if a publisher offers less than what was asked for."""
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        if not offered:
+        if not offered or self.writer is None:
             return  # only subscribed so far
-        topic_id = self.writer.add_topic(topic, type_name, qos=[_profile(qos) for qos in offered])
+        tap = self.taps.get(topic)
+        wanted = _as_reliable_as(offered)
+        if tap is not None and any(
+            qos_check_compatible(qos, tap.qos)[0] == QoSCompatibility.ERROR for qos in offered
+        ):
+            self.get_logger().warning(f"{topic}: a publisher offers less than the others: subscribing again")
+            with self.lock:
+                self.taps.pop(topic).close()
+            tap = None
+        if tap is None:
+            tap = self._tap(topic, type_name, wanted)
+        tap.publishers = max(tap.publishers, len(offered))
 
-        def write(data: bytes, info: Any) -> None:
-            if self.writer is not None:
-                self.writer.write(topic_id, data, time.time_ns(), info["source_timestamp"], self.counts[topic])
-                self.counts[topic] += 1
-                self.counts["recorded"] += 1
+    def _tap(self, topic: str, type_name: str, qos: QoSProfile) -> Tap:
+        tap = Tap(self, topic, type_name, qos)
+        with self.lock:
+            self.taps[topic] = tap
+        return tap
 
-        self.recorded[topic] = self.create_subscription(
-            _message_class(type_name), topic, write, _as_reliable_as(offered), raw=True
-        )
-        if topic == "/parameter_events":
-            self.parameter_events = topic_id
+    def _current_taps(self) -> list[Tap]:
+        with self.lock:
+            return list(self.taps.values())
 
-    def _write_snapshot(self, event: ParameterEvent) -> None:
-        if self.writer is not None and "/parameter_events" in self.recorded:
-            now = time.time_ns()
-            kind = "rcl_interfaces/msg/ParameterEvent"
-            data = without_padding(kind, schema.definition(kind), serialize_message(event))
-            self.writer.write(self.parameter_events, data, now, now)
+    # What is written
+
+    def _open(self) -> BagWriter:
+        try:
+            return BagWriter(
+                self.folder,
+                compression=self.compression,
+                max_bytes=self.max_bytes,
+                max_duration_s=self.max_duration,
+            )
+        except BagError as error:
+            raise ValueError(str(error)) from None
+
+    def _write(self, messages: list[Taken]) -> None:
+        """Called by the taps' thread."""
+        writer = self.writer
+        if writer is None or self.failure:
+            return
+        try:
+            for received_ns, published_ns, sequence, tap, data in messages:
+                topic_id = tap.topic_id or self._announce(writer, tap)
+                writer.write(topic_id, data, received_ns, published_ns, sequence)
+        except BagError as error:
+            self._fail(error)
+        self.counts["recorded"] += len(messages)
+
+    def _announce(self, writer: BagWriter, tap: Tap) -> int:
+        offered = [_profile(info.qos_profile) for info in self.get_publishers_info_by_topic(tap.topic)]
+        tap.topic_id = writer.add_topic(tap.topic, tap.type_name, qos=offered or [_profile(tap.qos)])
+        return tap.topic_id
+
+    def _write_snapshot(self, event: ParameterEvent, asked_ns: int) -> None:
+        tap = self.taps.get(PARAMETER_EVENTS)
+        writer = self.writer
+        if writer is None or self.failure or tap is None:
+            return
+        data = without_padding(tap.type_name, schema.definition(tap.type_name), serialize_message(event))
+        try:
+            writer.write(tap.topic_id or self._announce(writer, tap), data, time.time_ns(), asked_ns)
+        except BagError as error:
+            self._fail(error)
+
+    def _fail(self, error: BagError) -> None:
+        """Say so at once, and let go of the topics: a reader that does not read would hold the loop up."""
+        self.failure = str(error)
+        self.get_logger().error(self.failure)
+        self.publish_diagnostics()
+        self.create_timer(0.0, self._let_go)
+
+    def _let_go(self) -> None:
+        self.discovery.cancel()
+        with self.lock:
+            while self.taps:
+                self.taps.popitem()[1].close()
+
+    # State
+
+    def _account(self) -> dict[str, str]:
+        lost = {f"lost {tap.topic}": str(tap.lost) for tap in self.taps.values() if tap.lost}
+        return {"namespace": self.get_namespace(), "recorded": str(self.counts["recorded"]), "lost": str(self.lost), **lost}
+
+    @property
+    def lost(self) -> int:
+        """Messages lost so far."""
+        return sum(tap.lost for tap in self.taps.values())
 
     def state(self) -> tuple[int, str, dict[str, object]]:
-        return OK, f"recording {len(self.recorded)} topics to {self.folder}", {"bag": self.folder}
-
-
-def _message_class(type_name: str) -> Any:
-    package, _, name = type_name.partition("/msg/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
+        facts: dict[str, object] = {"bag": self.folder, "topics": len(self.taps), "lost": self.lost}
+        if self.failure:
+            return ERROR, self.failure, facts
+        if self.lost:
+            worst = max(self.taps.values(), key=lambda tap: tap.lost)
+            return WARN, f"{self.lost} messages lost, most on {worst.topic}: set lossless, or leave topics out", facts
+        return OK, f"recording {len(self.taps)} topics to {self.folder}", facts
 
 
 def _profile(qos: QoSProfile) -> QosProfile:
@@ -105,9 +237,16 @@ def _profile(qos: QoSProfile) -> QosProfile:
     )
 
 
+def _expected_qos(name: str) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if name == "scenario_plan" else DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=durability
+    )
+
+
 def _as_reliable_as(offered: list[QoSProfile]) -> QoSProfile:
-    """The strongest quality of service that every publisher offers."""
-    profile = QoSProfile(depth=DEPTH)
+    """The strongest quality of service that every publisher offers, keep-all."""
+    profile = QoSProfile(history=HistoryPolicy.KEEP_ALL)
     if any(qos.reliability == ReliabilityPolicy.BEST_EFFORT for qos in offered):
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
     if all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered):

@@ -41,14 +41,16 @@ class RemoteNode:
             self._node.destroy_client(client)
 
     def parameters(self, names: Sequence[str]) -> dict[str, Any]:
-        """Parameters by name; one that the node does not have is None.
+        """Parameters by name; all are None if the node does not have one of them.
 
         Raises:
             LoopLostError: no answer.
         """
-        values = self.call(GetParameters, f"{self.name}/get_parameters", GetParameters.Request(names=list(names))).values
-        found = {name: plain(parameter_value_to_python(value)) for name, value in zip(names, values)}  # none at all if
-        return {name: found.get(name) for name in names}  # one is unknown
+        request = GetParameters.Request(names=list(names))
+        values = self.call(GetParameters, f"{self.name}/get_parameters", request).values
+        if len(values) != len(names):
+            return dict.fromkeys(names)
+        return {name: plain(parameter_value_to_python(value)) for name, value in zip(names, values, strict=True)}
 
     def set_parameters(self, values: Mapping[str, Any]) -> None:
         """Set parameters as a whole.

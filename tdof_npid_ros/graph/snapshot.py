@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,19 +12,26 @@ from rclpy.node import Node
 
 
 class ParameterSnapshots:
-    """Asks each node of a namespace for all its parameters and hands them over as a `ParameterEvent`."""
+    """Asks each node of a namespace for all its parameters and hands them over as a `ParameterEvent`.
 
-    def __init__(self, node: Node, take: Callable[[ParameterEvent], None]) -> None:
+    Args:
+        take: gets each event and when its values were asked for, in ns since the epoch: a change that was published
+            after that time is not older than the values.
+    """
+
+    def __init__(self, node: Node, take: Callable[[ParameterEvent, int], None]) -> None:
         self._node = node
         self._take = take
-        self._asked: dict[str, Any] = {}
+        self._asked: dict[str, list[Any]] = {}
 
     def look(self) -> None:
-        """Ask the nodes that have appeared since the last look."""
-        namespace = self._node.get_namespace()
-        for name, its_namespace in self._node.get_node_names_and_namespaces():
-            full_name = f"{its_namespace.rstrip('/')}/{name}"
-            if its_namespace == namespace and full_name not in self._asked and not name.startswith("_"):
+        """Ask the nodes that have appeared since the last look, also those that come back."""
+        namespace = self._node.get_namespace().rstrip("/") + "/"
+        present = {f"{its.rstrip('/')}/{name}" for name, its in self._node.get_node_names_and_namespaces()}
+        for gone in self._asked.keys() - present:
+            self._forget(gone)
+        for full_name in present - self._asked.keys():
+            if full_name.startswith(namespace) and not full_name.rpartition("/")[2].startswith("_"):
                 self._ask(full_name)
 
     def _ask(self, full_name: str) -> None:
@@ -33,9 +41,12 @@ class ParameterSnapshots:
             self._node.destroy_client(lister)
             self._node.destroy_client(getter)
             return  # not up yet: the next look asks again
-        self._asked[full_name] = (lister, getter)
+        self._asked[full_name] = [lister, getter]
+        asked_ns = 0
 
         def listed(future: Any) -> None:
+            nonlocal asked_ns
+            asked_ns = time.time_ns()
             names = list(future.result().result.names)
             getter.call_async(GetParameters.Request(names=names)).add_done_callback(lambda f: got(names, f))
 
@@ -44,6 +55,10 @@ class ParameterSnapshots:
             event.new_parameters = [
                 Parameter(name=name, value=value) for name, value in zip(names, future.result().values, strict=True)
             ]
-            self._take(event)
+            self._take(event, asked_ns)
 
         lister.call_async(ListParameters.Request()).add_done_callback(listed)
+
+    def _forget(self, full_name: str) -> None:
+        for client in self._asked.pop(full_name):
+            self._node.destroy_client(client)

@@ -6,10 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
@@ -27,6 +23,7 @@ REFERENCE: dict[str, Any] = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
 WIDTH = 10.0  # inches
 DPI = 120
 TITLE_SIZE = 10  # points
+POINTS = 2000  # of a curve, about: more than its axes have pixels
 
 
 class Curve(NamedTuple):
@@ -108,7 +105,8 @@ def _draw_panel(panel: Panel, ax: Axes) -> None:
     if panel.reference is not None:
         ax.axhline(panel.reference * panel.scale, **REFERENCE)
     for curve in panel.curves:
-        shown = curve.time <= panel.until
+        samples = int(np.searchsorted(curve.time, panel.until, side="right"))
+        shown = slice(0, samples, max(1, samples // POINTS))
         style = {name: STYLE[curve.controller][name] for name in ("color", "linestyle")}
         value = curve.value[shown] * panel.scale
         ax.plot(curve.time[shown], value, linewidth=1.4, label=CONTROLLER_TITLES[curve.controller], **style)

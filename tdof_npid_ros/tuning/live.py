@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ class LiveLoop(Protocol):
             LoopLostError: the loop stopped answering; nothing of the episode counts.
         """
         ...
+
+
+L = TypeVar("L", bound=LiveLoop)
 
 
 def integrals_of(signals: Signals, output: Array) -> Integrals:
@@ -126,7 +129,7 @@ def shares(waiting: Mapping[str, Indices], loops: int) -> list[list[tuple[str, I
 
 
 def measure(
-    candidates: Array, usable_loops: Callable[[], Sequence[LiveLoop]], lost: Callable[[LiveLoop, LoopLostError], None]
+    candidates: Array, usable_loops: Callable[[], Sequence[L]], lost: Callable[[L, LoopLostError], None]
 ) -> tuple[Integrals, Integrals]:
     """Integrals of both episodes for all candidates (n, gains), by all usable loops at once.
 
@@ -139,7 +142,7 @@ def measure(
     results = {episode: Integrals(*np.empty((2, len(candidates)))) for episode in EPISODES}
     done = {episode: np.zeros(len(candidates), dtype=bool) for episode in EPISODES}
 
-    def work(loop: LiveLoop, share: list[tuple[str, Indices]]) -> None:
+    def work(loop: L, share: list[tuple[str, Indices]]) -> None:
         for episode, part in share:
             measured = loop.run_episode(episode, candidates[part])
             results[episode].iae[part], results[episode].sound_share[part] = measured.iae, measured.sound_share
@@ -148,8 +151,9 @@ def measure(
     while not all(finished.all() for finished in done.values()):
         loops = usable_loops()
         waiting = {episode: np.flatnonzero(~finished) for episode, finished in done.items()}
+        given = shares(waiting, len(loops))
         with ThreadPoolExecutor(len(loops)) as pool:
-            running = [(loop, pool.submit(work, loop, s)) for loop, s in zip(loops, shares(waiting, len(loops)))]
+            running = [(loop, pool.submit(work, loop, s)) for loop, s in zip(loops, given, strict=True)]
         for loop, outcome in running:
             try:
                 outcome.result()

@@ -213,7 +213,9 @@ class Graph:
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         if atomically:
             service = SetParametersAtomically
-            return [self.call(f"{node}/set_parameters_atomically", service, service.Request(parameters=parameters)).result]
+            return [
+                self.call(f"{node}/set_parameters_atomically", service, service.Request(parameters=parameters)).result
+            ]
         request = SetParameters.Request(parameters=parameters)
         return list(self.call(f"{node}/set_parameters", SetParameters, request).results)
 

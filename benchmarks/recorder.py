@@ -1,0 +1,95 @@
+"""What recording costs a lockstep loop, and whether anything is lost at its full speed."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.harness import Result, Verdict, main, summary
+
+QUESTION = "A lockstep loop at full speed: unrecorded, recorded, and recorded with lossless"
+NAMESPACE = "/bench"
+TIMEOUT = 600.0  # s
+VARIANTS: dict[str, dict[str, Any] | None] = {"unrecorded": None, "recorded": {}, "recorded, lossless": {"lossless": True}}
+
+
+def run(size: str) -> Result:
+    """The variants in turn, so that all see the same machine; each bag is verified (E2) and compared (E1)."""
+    from tdof_npid_ros.analysis.report import analyze
+    from tdof_npid_ros.analysis.verify import verify
+    from tdof_npid_ros.bag.reader import BagReader
+
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", "88")
+    rounds, steps = (3, 100_000) if size == "full" else (1, 2_000)
+    result = Result(QUESTION)
+    speeds: dict[str, list[float]] = {name: [] for name in VARIANTS}
+    lost, unequal, off = 0, 0, 0.0
+    for round_ in range(rounds):
+        for name, parameters in VARIANTS.items():
+            with tempfile.TemporaryDirectory() as folder:
+                speeds[name].append(run_loop(Path(folder), steps, parameters))
+                if parameters is None:
+                    continue
+                bag = Path(folder) / "bag"
+                with BagReader(bag) as reader:
+                    lost += int(reader.custom_data["lost"])
+                start = time.perf_counter()
+                account = verify(bag)
+                seconds = time.perf_counter() - start
+                unequal += steps + 1 - account.equal
+                (report,) = analyze([bag]).episodes
+                off = max(off, report.deviation.output or 0.0, report.deviation.control_effort or 0.0)
+                off += report.episode.missing
+        result.notes.append(f"round {round_ + 1}: verify took {seconds:.2f} s for {steps + 1} steps")
+    result.rates = [summary(name, "steps/s", values) for name, values in speeds.items()]
+    unrecorded = result.rates[0].median
+    for name, values in zip(list(VARIANTS)[1:], result.rates[1:], strict=True):
+        result.verdicts.append(Verdict(f"{name} against unrecorded", values.median / unrecorded, 0.5))
+    result.verdicts.append(Verdict(f"messages lost in {2 * rounds} runs of {steps} steps", lost, 0, at_most=True))
+    result.verdicts.append(Verdict("control efforts that E2 does not confirm", unequal, 0, at_most=True))
+    result.verdicts.append(Verdict("largest deviation from the simulation (E1), or outputs missing", off, 0, at_most=True))
+    return result
+
+
+def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None) -> float:
+    """One episode of Process 1 through the nodes; returns its steps per second. The bag is `folder/bag`.
+
+    Args:
+        recording: the loop's parameters while it is recorded; None: it is not.
+    """
+    from tdof_npid_ros.case import load_case
+    from tdof_npid_ros.graph.conductor import Conductor
+    from tdof_npid_ros.graph.processes import NodeProcesses
+
+    period = load_case("p1-c0.5").sample_period
+    file = folder / "bench.yaml"
+    file.write_text(
+        f"/**: {{ros__parameters: {{sample_period: {period}, mode: lockstep}}}}\n"
+        "/**/controller: {ros__parameters: {kp: 9.4, ki: 9.4, kd: 2.1, alpha: 0.3}}\n"
+        "/**/scenario: {ros__parameters: {play: false, episodes: [run], plan: {run: "
+        f'["0 setpoint 1", "{steps * period} end"]}}}}}}\n'
+    )
+    recorded = recording is not None
+    with NodeProcesses(file, NAMESPACE) as nodes:
+        if recorded:
+            nodes.start("recorder", {"bag": folder / "bag"})
+        for node in ("plant", "controller", "scenario"):
+            nodes.start(node, recording)
+        conductor = Conductor(NAMESPACE, nodes.check)
+        try:
+            watched = {"output": 1 + recorded, "control_effort": 1 + recorded, "scenario_plan": 2 + recorded}
+            conductor.wait_for_subscriptions(watched, TIMEOUT)
+            start = time.monotonic()
+            conductor.trigger("scenario/play")
+            conductor.wait(lambda: conductor.fact("plant", "state") == "finished", "the episode's end", TIMEOUT)
+            return steps / (time.monotonic() - start)
+        finally:
+            conductor.close()
+
+
+if __name__ == "__main__":
+    main(run)

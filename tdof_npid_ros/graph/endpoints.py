@@ -1,0 +1,137 @@
+"""Who else is on a topic: quality-of-service profiles that do not fit, and publishers too many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import (
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+
+LOOKS = 5  # looks, one a second, after something has changed: names of nodes arrive later than their topics
+FOREVER_NS = 2**62
+
+
+def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0) -> QoSProfile:
+    """Reliable, the latest `depth`; deadline and liveliness lease in s, 0 for none."""
+    profile = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+    if deadline > 0:
+        profile.deadline = Duration(nanoseconds=round(deadline * 1e9))
+    if lease > 0:
+        profile.liveliness = LivelinessPolicy.AUTOMATIC
+        profile.liveliness_lease_duration = Duration(nanoseconds=round(lease * 1e9))
+    return profile
+
+
+class Endpoints:
+    """Watches the topics of one node.
+
+    Args:
+        refuse: called with a count's name and a cause, for what is to be counted and logged once.
+    """
+
+    def __init__(self, node: Node, refuse: Callable[[str, str], None]) -> None:
+        self._node = node
+        self._refuse = refuse
+        self._published: dict[str, QoSProfile] = {}
+        self._subscribed: dict[str, tuple[QoSProfile, bool]] = {}
+        self._looks = 0
+        self.conflicts: list[str] = []
+
+    def forget(self) -> None:
+        """Watch no topic any more."""
+        self._published.clear()
+        self._subscribed.clear()
+        self.conflicts = []
+
+    def publisher_events(
+        self, topic: str, qos: QoSProfile, matched: Callable[[Any], None] | None = None
+    ) -> PublisherEventCallbacks:
+        """The callbacks for a publisher that this node is about to create."""
+        name = self._node.resolve_topic_name(topic)
+        self._published[name] = qos
+
+        def on_matched(event: Any) -> None:
+            self._looks = LOOKS
+            if matched is not None:
+                matched(event)
+
+        return PublisherEventCallbacks(
+            matched=on_matched,
+            incompatible_qos=self._on_change,
+            deadline=lambda event: self._refuse("deadline_missed", f"{topic}: the deadline offered was missed"),
+            liveliness=lambda event: self._refuse("liveliness_lost", f"{topic}: this publisher lost its liveliness"),
+        )
+
+    def subscription_events(self, topic: str, qos: QoSProfile, sole: bool) -> SubscriptionEventCallbacks:
+        """The callbacks for a subscription that this node is about to create; `sole`: one publisher is expected."""
+        name = self._node.resolve_topic_name(topic)
+        self._subscribed[name] = qos, sole
+
+        def on_liveliness(event: Any) -> None:
+            if event.not_alive_count_change > 0:
+                self._refuse("publisher_not_alive", f"{topic}: its publisher is not alive any more")
+
+        return SubscriptionEventCallbacks(
+            matched=self._on_change,
+            incompatible_qos=self._on_change,
+            liveliness=on_liveliness,
+            deadline=lambda event: self._refuse("deadline_missed", f"{topic}: the deadline requested was missed"),
+        )
+
+    def _on_change(self, event: Any) -> None:
+        self._looks = LOOKS
+
+    def look(self) -> None:
+        """Once a second: what does not fit, if something has changed lately."""
+        if self._looks == 0:
+            return
+        self._looks -= 1
+        before, self.conflicts = self.conflicts, []
+        for topic, qos in self._published.items():
+            for other in self._node.get_subscriptions_info_by_topic(topic):
+                self._compare(topic, "requests", other, qos, qos, other.qos_profile)
+        for topic, (qos, sole) in self._subscribed.items():
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            for other in publishers:
+                self._compare(topic, "offers", other, qos, other.qos_profile, qos)
+            if sole and len(publishers) > 1:
+                names = ", ".join(sorted(full_name(other) for other in publishers))
+                self.conflicts.append(f"{topic} has {len(publishers)} publishers ({names}): stop all but one")
+        for conflict in self.conflicts:
+            if conflict not in before:
+                self._refuse("conflicts", conflict)
+
+    def _compare(
+        self, topic: str, does: str, other: Any, own: QoSProfile, offered: QoSProfile, requested: QoSProfile
+    ) -> None:
+        compatible, _ = qos_check_compatible(offered, requested)
+        if compatible == QoSCompatibility.ERROR:
+            mine = "offers" if does == "requests" else "requests"
+            self.conflicts.append(
+                f"{topic}: {full_name(other)} {does} {described(other.qos_profile)}, but this node {mine} "
+                f"{described(own)}: no message passes between them; give both the same"
+            )
+
+
+def full_name(endpoint: Any) -> str:
+    """The name of an endpoint's node with its namespace."""
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+
+
+def described(qos: QoSProfile) -> str:
+    """What matters of a profile, in one line."""
+    words = [qos.reliability.name.lower(), qos.durability.name.lower()]
+    for name, duration in (("deadline", qos.deadline), ("liveliness lease", qos.liveliness_lease_duration)):
+        if 0 < duration.nanoseconds < FOREVER_NS:
+            words.append(f"{name} {duration.nanoseconds / 1e9:g} s")
+    return ", ".join(words)

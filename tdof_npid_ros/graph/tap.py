@@ -1,0 +1,163 @@
+"""Raw subscriptions that are emptied by a thread of their own, with publish and receive times.
+
+An executor wakes for every message, which costs several times the message. Here a thread sleeps a few milliseconds,
+then takes whatever has come in the meantime.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import time
+from collections.abc import Callable, Iterable
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+SHORTEST_PAUSE = 0.002  # s between two looks while messages come
+LONGEST_PAUSE = 0.05  # s between two looks while nothing comes; DDS keeps 5000 messages for each subscription
+MOST_AT_ONCE = 5000  # messages of one topic in one look, so that all topics get their turn
+
+
+class Taken(NamedTuple):
+    """A message as it came: serialized, times in ns since the epoch, the publisher's count (0: not known)."""
+
+    received_ns: int
+    published_ns: int
+    sequence: int
+    tap: Tap
+    data: bytes
+
+
+class _NotForExecutors(MutuallyExclusiveCallbackGroup):
+    """A callback group whose subscriptions no executor takes from; their events it serves."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return not isinstance(entity, Subscription) and bool(super().can_execute(entity))
+
+
+class Tap:
+    """One topic's subscription.
+
+    Attributes:
+        topic_id: in the bag; None until the topic is announced there.
+        received: messages taken.
+        lost: messages that DDS reported as lost, or that a gap in the publisher's count shows to be.
+    """
+
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile) -> None:
+        self.topic = topic
+        self.qos = qos
+        self.topic_id: int | None = None
+        self.received = 0
+        self.publishers = 1
+        self._reported_lost = self._gaps = 0
+        self._next: int | None = None
+        self.type_name = type_name
+        self._node = node
+        self._type = message_class(type_name)
+        self._subscription = node.create_subscription(
+            self._type,
+            topic,
+            _never_called,
+            qos,
+            raw=True,
+            callback_group=_NotForExecutors(),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost, use_default_callbacks=False),
+        )
+
+    @property
+    def lost(self) -> int:
+        """Messages lost so far."""
+        return max(self._reported_lost, self._gaps)
+
+    def take(self) -> list[Taken]:
+        """What has come since the last look, in order."""
+        found: list[Taken] = []
+        handle, kind = self._subscription.handle, self._type
+        with handle:
+            while len(found) < MOST_AT_ONCE:
+                message = handle.take_message(kind, True)
+                if message is None:
+                    break
+                data, info = message
+                found.append(
+                    Taken(
+                        info["received_timestamp"] or time.time_ns(),
+                        info["source_timestamp"],
+                        info["publication_sequence_number"] or 0,
+                        self,
+                        data,
+                    )
+                )
+        self.received += len(found)
+        if found:
+            self._count_gaps(found)
+        return found
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+    def _count_gaps(self, found: list[Taken]) -> None:
+        """Compare the publisher's count with what came; with several publishers, DDS's own reports must do."""
+        first, last = found[0].sequence, found[-1].sequence
+        whole = last - first == len(found) - 1 and self._next in (None, first)
+        if not whole and self.publishers == 1:
+            for message in found:
+                if self._next is not None and message.sequence > self._next:
+                    self._gaps += message.sequence - self._next
+                self._next = message.sequence + 1 if message.sequence else None
+        self._next = last + 1 if last else None
+
+    def _on_lost(self, event: Any) -> None:
+        self._reported_lost = event.total_count
+
+
+class TapThread:
+    """Empties taps and hands over what came, in the order in which it was received."""
+
+    def __init__(self, taps: Callable[[], Iterable[Tap]], hand_over: Callable[[list[Taken]], None]) -> None:
+        self._taps = taps
+        self._hand_over = hand_over
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="taps", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Take what is still there, and end."""
+        self._stop.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        pause = SHORTEST_PAUSE
+        while not self._stop.wait(pause):
+            pause = SHORTEST_PAUSE if self._look() else min(2 * pause, LONGEST_PAUSE)
+        self._look()
+
+    def _look(self) -> bool:
+        found = [message for tap in self._taps() for message in tap.take()]
+        if found:
+            found.sort(key=itemgetter(0))
+            self._hand_over(found)
+        return bool(found)
+
+
+def message_class(type_name: str) -> Any:
+    """The class of a message type such as `sensor_msgs/msg/JointState`.
+
+    Raises:
+        ImportError, AttributeError: it is not installed.
+    """
+    package, _, name = type_name.partition("/msg/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def _never_called(_: bytes) -> None:
+    raise AssertionError("taps are emptied by their thread")

@@ -1,0 +1,69 @@
+"""How a process keeps time: percentiles of the latest durations, and what the system allows a realtime loop."""
+
+from __future__ import annotations
+
+import gc
+import os
+from pathlib import Path
+
+import numpy as np
+
+LATEST = 4096  # durations that the percentiles are of
+
+
+class LatestTimes:
+    """The latest durations, in ns."""
+
+    def __init__(self) -> None:
+        self._times = np.zeros(LATEST, dtype=np.int64)
+        self._count = 0
+
+    def add(self, duration_ns: int) -> None:
+        """Note a duration."""
+        self._times[self._count % LATEST] = duration_ns
+        self._count += 1
+
+    def facts(self, name: str) -> dict[str, object]:
+        """Percentiles in microseconds, for the diagnostics."""
+        if not self._count:
+            return {}
+        p50, p99, most = np.percentile(self._times[: self._count], (50, 99, 100)) / 1e3
+        return {f"{name}_p50_us": f"{p50:.1f}", f"{name}_p99_us": f"{p99:.1f}", f"{name}_max_us": f"{most:.1f}"}
+
+
+def prepare_for_realtime(priority: int, cpu: int) -> list[str]:
+    """Keep the garbage collector out of the loop and take the priority and processor asked for.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; 0: as it is.
+        cpu: number of the processor to stay on; -1: any.
+
+    Returns:
+        What the system did not allow, one line each, with the remedy.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    refusals = []
+    threads = [int(path.name) for path in Path("/proc/self/task").iterdir()]
+    if priority:
+        try:
+            for thread in threads:
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+        except OSError as error:
+            refusals.append(
+                f"priority {priority} not taken ({error.strerror}): allow it with `rtprio 99` in /etc/security/limits.conf"
+            )
+    if cpu >= 0:
+        try:
+            for thread in threads:
+                os.sched_setaffinity(thread, {cpu})
+        except OSError as error:
+            refusals.append(f"cpu {cpu} not taken ({error.strerror}): it must be one of {os.sched_getaffinity(0)}")
+    return refusals
+
+
+def collect_garbage() -> None:
+    """Once in a while, what a loop without garbage collector has left in cycles; young objects only, some 100 us."""
+    if not gc.isenabled():
+        gc.collect(0)

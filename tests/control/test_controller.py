@@ -1,0 +1,211 @@
+"""What an operator may do to a running controller, and what it does to the effort."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.control.controller import Controller, parameters_digest
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, GainsError
+from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
+
+H = 0.01  # s
+PERIOD_NS = 10_000_000
+GAINS = Gains("tdof_npid2", kp=2.0, ki=1.5, kd=0.3, alpha=0.3, beta=0.2, sigma=0.8)
+
+
+class Loop:
+    """A controller on y' = u - y, which is slow enough that a jump of u stands out."""
+
+    def __init__(self, gains: Gains = GAINS, operation: Operation = PLAIN, setpoint: float = 1.0) -> None:
+        self.controller = Controller(gains, PERIOD_NS, operation)
+        self.setpoint, self.y, self.k = setpoint, 0.0, 0
+        self.efforts: list[float] = []
+
+    def run(self, steps: int) -> list[float]:
+        """The efforts of so many steps."""
+        for _ in range(steps):
+            self.controller.answer(self.k * PERIOD_NS, np.array([self.setpoint]), np.array([self.y]))
+            self.efforts.append(float(self.controller.effort[0]))
+            self.y += H * (self.efforts[-1] - self.y)
+            self.k += 1
+        return self.efforts[-steps:]
+
+    def change(self, gains: dict[str, Any] | None = None, **operation: Any) -> None:
+        values = self.controller.operation.as_dict() | operation
+        self.controller.change(self.controller.gains.with_values(**(gains or {})), Operation(**values))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"type": kind} for kind in CONTROLLER_TYPES),
+        {"kp": 9.0}, {"ki": 0.1}, {"kd": 2.0}, {"kd": 0.0}, {"alpha": 0.9}, {"beta": 0.9}, {"sigma": 0.1}, {"n": 3.0},
+        {"kp": 0.1, "kd": 1.0, "alpha": 1.0, "type": "npid"},
+        {"anti_windup": "back_calculation"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_changing_any_gain_or_the_type_is_bumpless(change: dict[str, Any]) -> None:
+    changed, unchanged = Loop(), Loop()
+    changed.run(60)
+    unchanged.run(60)
+    changed.change(change)
+    (u,), (expected,) = changed.run(1), unchanged.run(1)
+    assert u == pytest.approx(expected, abs=1e-12)
+    assert max(abs(np.diff([u, *changed.run(3)]))) < 0.2  # and nothing that was put off comes after
+
+
+def test_without_bumpless_a_change_acts_at_once() -> None:
+    loop = Loop(operation=Operation(bumpless=False))
+    before = loop.run(60)[-1]
+    loop.change({"kp": 9.0})
+    assert abs(loop.run(1)[0] - before) > 1.0
+
+
+def test_a_gain_without_integral_action_keeps_its_meaning() -> None:
+    loop = Loop(Gains("pid", kp=2.0))
+    loop.run(100)
+    loop.change({"kp": 3.0})
+    y = loop.y
+    assert loop.run(1)[0] == pytest.approx(3.0 * (1.0 - y))
+
+
+def test_manual_mode_and_bumpless_return() -> None:
+    loop = Loop()
+    loop.run(300)
+    loop.change(manual=True, manual_effort=0.4)
+    assert set(loop.run(200)) == {0.4}
+    loop.change(manual=False)
+    efforts = loop.run(1000)
+    assert efforts[0] == pytest.approx(0.4, abs=1e-12)
+    assert max(abs(np.diff(efforts))) < 0.02
+    assert loop.y == pytest.approx(1.0, abs=0.01)
+
+
+def test_manual_effort_keeps_the_limits() -> None:
+    loop = Loop(GAINS.with_values(effort_max=0.5), Operation(manual=True, manual_effort=3.0, effort_rate=10.0))
+    assert loop.run(8)[:6] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.5])
+
+
+def test_setpoint_ramp_starts_from_the_output_and_keeps_its_rate() -> None:
+    ramped = Loop(Gains("pid", kp=1.0), Operation(setpoint_rate=2.0))
+    ramped.y = 0.5
+    ramped.controller.answer(0, np.ones(1), np.array([0.5]))
+    assert ramped.controller.effort[0] == pytest.approx(0.02)
+    for k in range(1, 40):
+        ramped.controller.answer(k * PERIOD_NS, np.ones(1), np.zeros(1))
+    assert ramped.controller.effort[0] == 1.0  # exactly the setpoint, once it is reached
+
+
+def test_setpoint_limits() -> None:
+    loop = Loop(Gains("pid", kp=1.0), Operation(setpoint_min=-0.5, setpoint_max=0.25))
+    assert loop.run(1) == [0.25]
+    loop.setpoint, loop.y = -3.0, 0.0
+    assert loop.run(1) == [-0.5]
+
+
+def test_effort_rate_limit_holds_and_the_integral_does_not_wind_up() -> None:
+    gains = Gains("pid", kp=5.0, ki=20.0, anti_windup="conditional")
+    loop, wound_up = (
+        Loop(gains.with_values(anti_windup=kind), Operation(effort_rate=3.0)) for kind in ("conditional", "none")
+    )
+    efforts = loop.run(1500)
+    assert max(abs(np.diff([0.0, *efforts]))) <= 3.0 * H + 1e-12
+    assert loop.y == pytest.approx(1.0, abs=1e-3)
+    assert max(efforts) < 0.8 * max(wound_up.run(1500))
+
+
+def test_dead_band_ignores_small_errors_without_a_step() -> None:
+    loop = Loop(Gains("pid", kp=10.0, ki=1.0), Operation(dead_band=0.1))
+    for k, y in enumerate([0.91, 1.09, 1.0]):
+        loop.controller.answer(k * PERIOD_NS, np.ones(1), np.array([y]))
+        assert loop.controller.effort[0] == 0.0
+    loop.controller.answer(3 * PERIOD_NS, np.ones(1), np.array([0.85]))
+    assert loop.controller.effort[0] == pytest.approx(0.5)
+
+
+def test_measurement_filter_is_a_first_order_lag() -> None:
+    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, Operation(filter_time=0.1))
+    controller.answer(0, np.zeros(1), np.zeros(1))
+    for k in range(1, 11):
+        controller.answer(k * PERIOD_NS, np.zeros(1), np.ones(1))
+    assert -controller.effort[0] == pytest.approx(1.0 - math.exp(-1.0))
+
+
+@pytest.mark.parametrize(("r", "y", "error"), [(3.1, -3.1, -0.083185), (-3.1, 3.1, 0.083185), (7.0, 0.5, 0.216815)])
+def test_angles_go_the_shorter_way_round(r: float, y: float, error: float) -> None:
+    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, Operation(angle=True))
+    controller.answer(0, np.array([r]), np.array([y]))
+    assert controller.effort[0] == pytest.approx(error, abs=1e-6)
+
+
+def test_an_angle_passing_half_a_turn_gives_no_derivative_kick() -> None:
+    controller = Controller(Gains("tdof_npid2", kp=1.0, kd=1.0, alpha=0.5), PERIOD_NS, Operation(angle=True))
+    efforts = []
+    for k, angle in enumerate(np.arange(3.0, 3.3, 0.01)):
+        wrapped = angle if angle < math.pi else angle - 2 * math.pi
+        controller.answer(k * PERIOD_NS, np.array([wrapped]), np.array([wrapped]))
+        efforts.append(controller.effort[0])
+    assert max(abs(np.diff(efforts[5:]))) < 0.1
+
+
+def test_reverse_action() -> None:
+    direct, reverse = Loop(GAINS), Loop(GAINS.with_values(kp=-2.0, ki=-1.5, kd=-0.3))
+    for k in range(20):
+        y = np.array([0.1 * k])
+        direct.controller.answer(k * PERIOD_NS, np.ones(1), y)
+        reverse.controller.answer(k * PERIOD_NS, np.ones(1), y)
+        assert reverse.controller.effort[0] == -direct.controller.effort[0]
+
+
+def test_beginning_within_a_running_loop_goes_on_from_the_applied_effort() -> None:
+    loop = Loop()
+    loop.run(200)
+    newcomer = Controller(GAINS, PERIOD_NS)
+    newcomer.begin_within(np.array([loop.efforts[-1]]))
+    newcomer.answer(loop.k * PERIOD_NS, np.ones(1), np.array([loop.y]))
+    assert newcomer.effort[0] == pytest.approx(loop.efforts[-1], abs=1e-12)
+    again = Controller(GAINS, PERIOD_NS)  # as `verify` does it, from the integral action that the answer bears
+    again.begin_within(np.array([loop.efforts[-1]]), newcomer.terms[3].copy())
+    again.answer(loop.k * PERIOD_NS, np.ones(1), np.array([loop.y]))
+    assert again.effort[0] == newcomer.effort[0]
+
+
+def test_answers_depend_only_on_what_each_was_computed_with() -> None:
+    """Changes between two answers leave no trace but the last one: what `verify` relies on."""
+    once, often = Loop(), Loop()
+    once.run(20)
+    often.run(20)
+    once.change({"kp": 3.0}, dead_band=0.01)
+    for kp in (7.0, 0.5, 3.0):
+        often.change({"kp": kp, "type": "pid"}, effort_rate=kp)
+    often.change({"kp": 3.0, "type": "tdof_npid2"}, dead_band=0.01, effort_rate=math.inf)
+    assert once.run(50) == often.run(50)
+    assert once.controller.digest == often.controller.digest
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"setpoint_rate": 0.0}, "above 0"), ({"effort_rate": -1.0}, "above 0"), ({"dead_band": -1.0}, "not below 0"),
+        ({"filter_time": math.inf}, "finite"), ({"manual": 1}, "true or false"), ({"manual_effort": math.inf}, "finite"),
+        ({"setpoint_min": 1.0, "setpoint_max": 0.0}, "need setpoint_min"), ({"setpoint_rate": math.nan}, "nan"),
+    ],
+)  # fmt: skip
+def test_wrong_operation_is_refused(values: dict[str, Any], reason: str) -> None:
+    with pytest.raises(GainsError, match=reason):
+        operation_from_mapping(values)
+
+
+def test_manual_effort_must_fit_the_lanes() -> None:
+    with pytest.raises(GainsError, match="2 lanes"):
+        Controller(GAINS.with_values(kp=(1.0, 2.0)), PERIOD_NS, Operation(manual_effort=(1.0, 2.0, 3.0)))
+
+
+def test_every_operation_has_a_name_of_its_own() -> None:
+    digests = {parameters_digest(GAINS, PERIOD_NS, o) for o in (PLAIN, Operation(dead_band=0.1), Operation(manual=True))}
+    assert len(digests) == 3
