@@ -13,7 +13,11 @@ from benchmarks.harness import Result, Verdict, main, summary
 QUESTION = "A lockstep loop at full speed: unrecorded, recorded, and recorded with lossless"
 NAMESPACE = "/bench"
 TIMEOUT = 600.0  # s
-VARIANTS: dict[str, dict[str, Any] | None] = {"unrecorded": None, "recorded": {}, "recorded, lossless": {"lossless": True}}
+VARIANTS: dict[str, dict[str, Any] | None] = {
+    "unrecorded": None,
+    "recorded": {},
+    "recorded, lossless": {"lossless": True},
+}
 
 
 def run(size: str) -> Result:
@@ -51,7 +55,9 @@ def run(size: str) -> Result:
         result.verdicts.append(Verdict(f"{name} against unrecorded", values.median / unrecorded, 0.5))
     result.verdicts.append(Verdict(f"messages lost in {2 * rounds} runs of {steps} steps", lost, 0, at_most=True))
     result.verdicts.append(Verdict("control efforts that E2 does not confirm", unequal, 0, at_most=True))
-    result.verdicts.append(Verdict("largest deviation from the simulation (E1), or outputs missing", off, 0, at_most=True))
+    result.verdicts.append(
+        Verdict("largest deviation from the simulation (E1), or outputs missing", off, 0, at_most=True)
+    )
     return result
 
 

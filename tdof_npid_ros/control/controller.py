@@ -51,6 +51,16 @@ class Controller:
         """The name of the parameters that answers are computed with."""
         return self._digest
 
+    @property
+    def integral(self) -> np.ndarray:
+        """The integral action as the next answer will find it, (lanes,)."""
+        return np.array(self._state[INTEGRAL])
+
+    @property
+    def integral_before(self) -> np.ndarray:
+        """The integral action that the latest answer was computed with, (lanes,)."""
+        return np.asarray(self.terms[TERMS.index("integral")])
+
     def change(self, gains: Gains, operation: Operation) -> None:
         """Go on with other parameters. The state is kept, unless the number of lanes changes.
 

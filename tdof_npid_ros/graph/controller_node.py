@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import math
 import sys
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, GAIN_NAMES, Gains, gains_from_mapping
+from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, Gains, gains_from_mapping
+from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.control.stamps import Stamps
-from tdof_npid_ros.graph.messages import as_field, plan_from_message, signal_message, stamp_ns, values
-from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, WARN, LoopNode, number, run_node
+from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
+from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
+from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.messages import NO_VALUES, as_field, plan_from_message, signal_message, stamp_ns, values
+from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.scenario import Plan
 
 DESCRIPTIONS = {
@@ -34,7 +41,18 @@ DESCRIPTIONS = {
     "tracking_time": "s; of back_calculation; 0: sqrt(kd/ki), or kp/ki without derivative action",
     "integral_min": "lower limit of the integral action, in the effort's unit",
     "integral_max": "upper limit of the integral action, in the effort's unit",
+    "manual": "true: the effort is manual_effort; back to false without a jump",
+    "manual_effort": "effort in manual mode; an array gives one value per lane; also set by the topic manual_effort",
+    "setpoint_min": "lower limit of the setpoint, in the output's unit",
+    "setpoint_max": "upper limit of the setpoint, in the output's unit",
+    "setpoint_rate": "output units per second that the setpoint moves at most, above 0; inf: no ramp",
+    "effort_rate": "effort per second that the effort moves at most, above 0; inf: no limit",
+    "dead_band": "error that counts as none, in the output's unit",
+    "filter_time": "s; time constant of the output's first-order filter; 0: none",
+    "angle": "true: setpoint and output are angles in rad, the error is the shorter way round",
+    "bumpless": "true: changes of gains and type do not move the effort at once",
 }
+SECONDS = {"output_timeout": (0.0, 3600.0), "deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}
 
 
 class ControllerNode(LoopNode):
@@ -43,31 +61,69 @@ class ControllerNode(LoopNode):
     def __init__(self) -> None:
         super().__init__("controller")
         period = self.declare_value("sample_period", 0.01, "s; time between two outputs", fixed=True)
-        default = Gains().as_dict()
-        gains = gains_from_mapping(
-            {name: self.declare_value(name, default[name], DESCRIPTIONS[name]) for name in GAIN_NAMES}
+        default = {**Gains().as_dict(), **PLAIN.as_dict()}
+        given = {name: self.declare_value(name, default[name], text) for name, text in DESCRIPTIONS.items()}
+        self.quiet_parameters.add("manual_effort")
+        self._declare_options()
+        self.controller = Controller(
+            gains_from_mapping(given), sample_period_in_ns(period), operation_from_mapping(given)
         )
-        setpoint = self.declare_value("setpoint", 0.0, "setpoint until one arrives on the topic")
-        self.controller = Controller(gains, sample_period_in_ns(period))
-        self.controller.answer(0, np.zeros(gains.lanes), np.zeros(gains.lanes))  # compiles, before the first output
+        nothing = np.zeros(self.controller.lanes)
+        self.controller.answer(0, nothing, nothing)  # compiles, before the first output
         self.controller.reset()
-        self.setpoint = np.array([number("setpoint", setpoint)])
+        self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
+        if self.joints.names and len(self.joints.names) != self.controller.lanes:
+            raise ValueError(
+                f"joint_names has {len(self.joints.names)} names, but the gains are for {self.controller.lanes} lanes: "
+                "give kp one value per joint"
+            )
+        self.checked({})
+        self.changed(self.values_of(["setpoint", "output_timeout"]))
+        self.saved_integral: np.ndarray | None = None
         self.plan: Plan | None = None
         self.stamps = Stamps()
         self.waiting: JointState | None = None
         self.accept_changes()
 
+    def _declare_options(self) -> None:
+        declare = self.declare_value
+        declare("setpoint", 0.0, "setpoint until one arrives on the topic")
+        declare("output_timeout", 0.5, "s of wall time without output until it is reported; then no jump; 0: never")
+        declare("save_i_term", True, "keep the integral action while inactive")
+        declare(
+            "joint_names", [""], "joints of output and setpoint that are the lanes; none: all, in order", fixed=True
+        )
+        declare("deadline", 0.0, "s between two efforts that is promised on control_effort; 0: no promise", fixed=True)
+        declare("lease", 1.0, "s; lease of the liveliness promised on control_effort; 0: no promise", fixed=True)
+        declare("request_deadline", False, "refuse publishers of output that promise no deadline", fixed=True)
+        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
+        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
+
     def activate(self) -> None:
+        p = self.values_of(["deadline", "lease", "request_deadline", "priority", "cpu"])
+        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
+            self.get_logger().warning(refusal)
         self.stamps.forget()
         self.controller.reset()
+        self.latest_arrival_ns: int | None = None
+        self.silent = False
         self.effort = signal_message("")
+        self.effort.name = self.joints.names
         self.effort_for = ("", "")
         self.terms = signal_message("")
-        self.effort_publisher = self.create_publisher(JointState, "control_effort", SIGNAL_QOS)
-        self.state_publisher = self.create_publisher(JointState, "controller_state", SIGNAL_QOS)
-        self.create_subscription(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        self.create_subscription(JointState, "setpoint", self._on_setpoint, SIGNAL_QOS)
-        self.create_subscription(JointState, "output", self._on_output, SIGNAL_QOS)
+        effort_qos = signal_qos(1000, p["deadline"], p["lease"])
+        newest = signal_qos(1, p["deadline"] if p["request_deadline"] else 0.0)
+        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos)
+        self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
+        self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
+        self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
+        self.subscribe(JointState, "manual_effort", self._on_manual_effort, signal_qos(1))
+        self.subscribe(JointState, "output", self._on_output, newest, sole=True)
+        if self.output_timeout_ns:
+            self.create_timer(self.output_timeout_ns / 1e9, self._look_for_silence, clock=STEADY)
+
+    def deactivate(self) -> None:
+        self.saved_integral = self.controller.integral if self.values_of(["save_i_term"])["save_i_term"] else None
 
     # What arrives
 
@@ -82,54 +138,113 @@ class ControllerNode(LoopNode):
             self._on_output(self.waiting)
 
     def _on_setpoint(self, message: JointState) -> None:
-        r = values(message.position)
+        r = self._picked("setpoint", message.name, message.position)
+        if r is None:
+            return
         if len(r) not in (1, self.controller.lanes) or not np.isfinite(r).all():
             self.refuse("rejected", f"setpoint {list(r)[:8]} refused: it must be finite, one value or one per lane")
         else:
             self.setpoint = r.copy()
 
+    def _on_manual_effort(self, message: JointState) -> None:
+        effort = list(message.effort)
+        parameter = Parameter("manual_effort", value=effort if len(effort) > 1 else effort[0] if effort else math.nan)
+        if not self.set_parameters([parameter])[0].successful:
+            self.counts["rejected"] += 1
+
     def _on_output(self, message: JointState) -> None:
         stamp, episode = stamp_ns(message.header.stamp), message.header.frame_id
-        if not self._is_sound(message.position):
+        y = self._picked("output", message.name, message.position)
+        if y is None or not self._is_sound(y):
             return
         if "/" in episode:
             if self.plan is None or not episode.startswith(self.plan.digest):
                 self.waiting = message  # its plan is on the way
                 return
             self.waiting = None
-            setpoint = self._planned_setpoint(self.plan, stamp)
+            setpoint = np.full(self.controller.lanes, self.plan.value_at("setpoint", stamp))
         else:
+            episode = ""  # a robot's frame
             setpoint = np.broadcast_to(self.setpoint, (self.controller.lanes,))
         verdict = self.stamps.take(stamp, episode)
         if verdict == "late":
             self.counts["late"] += 1
             return
-        if verdict == "restart":
-            self.controller.reset()
-        if self.controller.answer(stamp, setpoint, values(message.position)):
-            self.counts["steps"] += 1
-            self.answered_setpoint = setpoint
-            saturated = (
-                not self.controller.gains.effort_min < self.controller.effort[0] < self.controller.gains.effort_max
-            )
-            self.counts["saturated"] += saturated
+        begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, message)
+        if self.controller.answer(stamp, setpoint, y):
+            self._note_answer(setpoint, begins_within)
         else:
             self.counts["repeated"] += 1
         self._publish_answer(message, episode)
 
-    def _planned_setpoint(self, plan: Plan, stamp: int) -> np.ndarray:
-        r = plan.value_at("setpoint", stamp)
-        return np.full(self.controller.lanes, r)
+    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, message: JointState) -> bool:
+        """Reset the controller at a loop's start, or let it begin within a running loop; True for the latter."""
+        now = time.monotonic_ns()
+        latest, self.latest_arrival_ns = self.latest_arrival_ns, now
+        was_silent = not episode and latest is not None and 0 < self.output_timeout_ns < now - latest
+        if self.silent or was_silent:
+            self.silent = False
+            self.get_logger().info("output comes again: going on")
+        if not (restarts or was_silent):
+            return False
+        if restarts and begins_from_nothing(stamp, episode):
+            self.controller.reset()
+            return False
+        applied = self._applied(message)
+        if applied is None:
+            return False
+        self.controller.begin_within(applied, self.saved_integral)
+        self.saved_integral = None
+        return True
 
-    def _is_sound(self, field: Any) -> bool:
+    def _applied(self, message: JointState) -> np.ndarray | None:
+        """The effort that the plant reports, or else our own latest; None if the controller is to begin from nothing."""
+        applied = self._picked("output", message.name, message.effort)
+        if applied is not None and len(applied) == self.controller.lanes and np.isfinite(applied).all():
+            return applied.copy()
+        if self.counts["steps"]:
+            return self.controller.effort.copy()
+        self.controller.reset()
+        return None
+
+    def _note_answer(self, setpoint: np.ndarray, begins_within: bool) -> None:
+        controller = self.controller
+        self.counts["steps"] += 1
+        self.answered_setpoint = setpoint
+        # The first answer within a running loop bears the integral action that it began with, for `verify`.
+        self.effort.velocity = as_field(controller.integral_before) if begins_within else NO_VALUES
+        if not controller.gains.effort_min < controller.effort[0] < controller.gains.effort_max:
+            self.counts["saturated"] += 1
+
+    def _picked(self, topic: str, names: Sequence[str], field: Any) -> np.ndarray | None:
+        """A field's values for the lanes; None if it is refused."""
+        if not self.joints.names:
+            return values(field)
+        try:
+            return self.joints.picked(names, values(field))
+        except ValueError as error:
+            self.refuse("rejected", f"{topic} refused: it {error}")
+            return None
+
+    def _is_sound(self, y: np.ndarray) -> bool:
         lanes = self.controller.lanes
-        if len(field) != lanes:
-            self.refuse("rejected", f"output with {len(field)} values refused: the gains are for {lanes} lanes")
-        elif not (math.isfinite(field[0]) if lanes == 1 else np.isfinite(values(field)).all()):
+        if len(y) != lanes:
+            self.refuse("rejected", f"output with {len(y)} values refused: the gains are for {lanes} lanes")
+        elif not (math.isfinite(y[0]) if lanes == 1 else np.isfinite(y).all()):
             self.refuse("rejected", "output that is not finite refused")
         else:
             return True
         return False
+
+    def _look_for_silence(self) -> None:
+        if self.silent or self.latest_arrival_ns is None or "/" in self.effort_for[1]:
+            return
+        if time.monotonic_ns() - self.latest_arrival_ns > self.output_timeout_ns:
+            self.silent = True
+            self.counts["silences"] += 1
+            self.get_logger().error(
+                f"no output for {self.output_timeout_ns / 1e9:g} s: the integral action waits. Look after the plant"
+            )
 
     # What goes out
 
@@ -155,16 +270,36 @@ class ControllerNode(LoopNode):
     # Parameters and state
 
     def checked(self, changes: dict[str, Any]) -> None:
-        self.controller.gains.with_values(**{name: value for name, value in changes.items() if name in GAIN_NAMES})
-        if "setpoint" in changes:
-            number("setpoint", changes["setpoint"])
+        self._configured(changes)
+        p = {**self.values_of(["setpoint", *SECONDS]), **changes}
+        self._setpoint(p["setpoint"])
+        for name, (low, high) in SECONDS.items():
+            number(name, p[name], low, high)
 
     def changed(self, changes: dict[str, Any]) -> None:
-        gains = {name: value for name, value in changes.items() if name in GAIN_NAMES}
-        if gains:
-            self.controller.change_gains(self.controller.gains.with_values(**gains))
+        if any(name in DESCRIPTIONS for name in changes):
+            self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
-            self.setpoint = np.array([number("setpoint", changes["setpoint"])])
+            self.setpoint = self._setpoint(changes["setpoint"])
+        if "output_timeout" in changes:
+            self.output_timeout_ns = round(changes["output_timeout"] * 1e9)
+
+    def _configured(self, changes: dict[str, Any]) -> tuple[Gains, Operation]:
+        """Gains and operation with some parameters changed; ValueError if they are not valid."""
+        now = {**self.controller.gains.as_dict(), **self.controller.operation.as_dict(), **changes}
+        gains, operation = gains_from_mapping(now), operation_from_mapping(now)
+        operation.check_lanes(gains)
+        if self.joints.names and gains.lanes != len(self.joints.names):
+            raise ValueError(
+                f"the gains are for {gains.lanes} lanes, but there are {len(self.joints.names)} joint_names"
+            )
+        return gains, operation
+
+    def _setpoint(self, value: Any) -> np.ndarray:
+        one_per_lane = value if isinstance(value, list) else [value]
+        if len(one_per_lane) not in (1, self.controller.lanes):
+            raise ValueError(f"setpoint has {len(one_per_lane)} values: give one, or one per lane")
+        return np.array([number("setpoint", one, -1e300, 1e300) for one in one_per_lane])
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         facts: dict[str, object] = {
@@ -173,10 +308,15 @@ class ControllerNode(LoopNode):
             "parameters": self.controller.digest,
         }
         if self.waiting is not None:
-            return WARN, "an output waits for its plan on scenario_plan", facts
+            return WARN, "an output waits for its plan on scenario_plan: start the scenario", facts
         if self.stamps.latest_ns is None:
             return WARN, "no output yet: start the plant, or remap output to your robot's joint_states", facts
-        return OK, "running", {**facts, "time_s": self.stamps.latest_ns / 1e9}
+        facts["time_s"] = self.stamps.latest_ns / 1e9
+        if self.silent:
+            return ERROR, "output has stopped: look after the plant; the effort is as it was", facts
+        if self.controller.operation.manual:
+            return OK, "in manual mode: set manual to false for the law", facts
+        return OK, "running", facts
 
 
 def main(args: list[str] | None = None) -> None:

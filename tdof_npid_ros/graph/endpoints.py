@@ -42,8 +42,9 @@ class Endpoints:
     def __init__(self, node: Node, refuse: Callable[[str, str], None]) -> None:
         self._node = node
         self._refuse = refuse
-        self._published: dict[str, QoSProfile] = {}
-        self._subscribed: dict[str, tuple[QoSProfile, bool]] = {}
+        self._published: set[str] = set()
+        self._subscribed: set[str] = set()
+        self._sole: set[str] = set()
         self._looks = 0
         self.conflicts: list[str] = []
 
@@ -51,14 +52,14 @@ class Endpoints:
         """Watch no topic any more."""
         self._published.clear()
         self._subscribed.clear()
+        self._sole.clear()
         self.conflicts = []
 
     def publisher_events(
-        self, topic: str, qos: QoSProfile, matched: Callable[[Any], None] | None = None
+        self, topic: str, matched: Callable[[Any], None] | None = None
     ) -> PublisherEventCallbacks:
         """The callbacks for a publisher that this node is about to create."""
-        name = self._node.resolve_topic_name(topic)
-        self._published[name] = qos
+        self._published.add(self._node.resolve_topic_name(topic))
 
         def on_matched(event: Any) -> None:
             self._looks = LOOKS
@@ -72,10 +73,12 @@ class Endpoints:
             liveliness=lambda event: self._refuse("liveliness_lost", f"{topic}: this publisher lost its liveliness"),
         )
 
-    def subscription_events(self, topic: str, qos: QoSProfile, sole: bool) -> SubscriptionEventCallbacks:
+    def subscription_events(self, topic: str, sole: bool) -> SubscriptionEventCallbacks:
         """The callbacks for a subscription that this node is about to create; `sole`: one publisher is expected."""
         name = self._node.resolve_topic_name(topic)
-        self._subscribed[name] = qos, sole
+        self._subscribed.add(name)
+        if sole:
+            self._sole.add(name)
 
         def on_liveliness(event: Any) -> None:
             if event.not_alive_count_change > 0:
@@ -97,30 +100,29 @@ class Endpoints:
             return
         self._looks -= 1
         before, self.conflicts = self.conflicts, []
-        for topic, qos in self._published.items():
-            for other in self._node.get_subscriptions_info_by_topic(topic):
-                self._compare(topic, "requests", other, qos, qos, other.qos_profile)
-        for topic, (qos, sole) in self._subscribed.items():
-            publishers = self._node.get_publishers_info_by_topic(topic)
-            for other in publishers:
-                self._compare(topic, "offers", other, qos, other.qos_profile, qos)
-            if sole and len(publishers) > 1:
-                names = ", ".join(sorted(full_name(other) for other in publishers))
-                self.conflicts.append(f"{topic} has {len(publishers)} publishers ({names}): stop all but one")
+        for topic in self._published | self._subscribed:
+            offers = self._node.get_publishers_info_by_topic(topic)
+            requests = self._node.get_subscriptions_info_by_topic(topic)
+            self._compare(topic, offers, requests)
+            if topic in self._sole and len(offers) > 1:
+                names = ", ".join(sorted(map(full_name, offers)))
+                self.conflicts.append(f"{topic} has {len(offers)} publishers ({names}): stop all but one")
         for conflict in self.conflicts:
             if conflict not in before:
                 self._refuse("conflicts", conflict)
 
-    def _compare(
-        self, topic: str, does: str, other: Any, own: QoSProfile, offered: QoSProfile, requested: QoSProfile
-    ) -> None:
-        compatible, _ = qos_check_compatible(offered, requested)
-        if compatible == QoSCompatibility.ERROR:
-            mine = "offers" if does == "requests" else "requests"
-            self.conflicts.append(
-                f"{topic}: {full_name(other)} {does} {described(other.qos_profile)}, but this node {mine} "
-                f"{described(own)}: no message passes between them; give both the same"
-            )
+    def _compare(self, topic: str, offers: list[Any], requests: list[Any]) -> None:
+        own_name = self._node.get_fully_qualified_name()
+        for offer in offers:
+            for request in requests:
+                if own_name not in (full_name(offer), full_name(request)):
+                    continue
+                compatible, _ = qos_check_compatible(offer.qos_profile, request.qos_profile)
+                if compatible == QoSCompatibility.ERROR:
+                    self.conflicts.append(
+                        f"{topic}: {full_name(offer)} offers {described(offer.qos_profile)}, but {full_name(request)} "
+                        f"requests {described(request.qos_profile)}: no message passes; give both the same"
+                    )
 
 
 def full_name(endpoint: Any) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -28,6 +29,7 @@ NEWEST_QOS = signal_qos(1)  # of subscriptions for which only the newest message
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
@@ -80,14 +82,14 @@ class LoopNode(LifecycleNode):
         self, message_type: Any, topic: str, qos: QoSProfile, matched: Callable[[Any], None] | None = None
     ) -> Any:
         """A publisher that reports missed deadlines and profiles that do not fit."""
-        events = self.endpoints.publisher_events(topic, qos, matched)
+        events = self.endpoints.publisher_events(topic, matched)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def subscribe(
         self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile, sole: bool = False
     ) -> None:
         """A subscription that reports profiles that do not fit and, if one publisher is expected, a second one."""
-        events = self.endpoints.subscription_events(topic, qos, sole)
+        events = self.endpoints.subscription_events(topic, sole)
         self.create_subscription(message_type, topic, callback, qos, event_callbacks=events)
 
     # Parameters
@@ -203,19 +205,14 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
 
 def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = None) -> None:
     """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # before any thread is made: `_Stop` alone takes them
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    stop = _Stop()
-    status, node = 0, None
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # before any thread is made: `Stop` alone takes them
+    stop = Stop()
+    node = None
     try:
-        node = make_node()
-        if node.autostart:
-            node.trigger_configure()
-            node.trigger_activate()
-            if node.activation_error is not None:
-                raise node.activation_error
+        node = _started(make_node, arguments)
         spin(node, stop)
-    except (ValueError, OSError, RuntimeError) as error:
+        status = 0
+    except StartError as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
         status = 2
     finally:
@@ -227,7 +224,25 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
     sys.exit(status)
 
 
-class _Stop:
+class StartError(RuntimeError):
+    """A node that cannot start; the message says why."""
+
+
+def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> LoopNode:
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node()
+        if node.autostart:
+            node.trigger_configure()
+            node.trigger_activate()
+            if node.activation_error is not None:
+                raise node.activation_error
+    except (ValueError, OSError, RuntimeError) as error:
+        raise StartError(" ".join(str(error).split())) from error
+    return node
+
+
+class Stop:
     """Waits for a signal to stop, beside the node, so that the node ends between two callbacks and in order."""
 
     def __init__(self) -> None:
@@ -246,16 +261,18 @@ class _Stop:
         self._wake = executor.wake
 
 
-def spin(node: LoopNode, stop: _Stop) -> None:
-    """Serve a node until it is to stop."""
+def spin(node: LoopNode, stop: Stop | None = None) -> None:
+    """Serve a node until it is to stop, or until its context is shut down."""
     executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
     executor.add_node(node)
-    stop.wakes(executor)
-    while rclpy.ok() and not stop.requested:
+    if stop is not None:
+        stop.wakes(executor)
+    while rclpy.ok() and not (stop and stop.requested):
         executor.spin_once(timeout_sec=SPIN_TIMEOUT)
 
 
 def fastest_executor() -> Any:
+    """The fastest executor for one node that this rclpy has."""
     try:
         from rclpy.experimental import EventsExecutor  # in Jazzy since 2025, and two to three times as fast
     except ImportError:

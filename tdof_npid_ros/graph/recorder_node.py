@@ -18,15 +18,18 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.bag import BagError, schema
 from tdof_npid_ros.bag.cdr import without_padding
 from tdof_npid_ros.bag.file_writer import COMPRESSIONS
 from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
-from tdof_npid_ros.graph.node import ERROR, OK, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.lossless import NO_LOG, TOPIC
+from tdof_npid_ros.graph.messages import set_stamp, signal_message
+from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
-from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
+from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
 CALM_LOOKS = 20  # looks without a change, after which there is one a second
@@ -68,6 +71,9 @@ class RecorderNode(LoopNode):
             fixed=True,
         )
         self.exclude = self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True)
+        self.lossless = self.declare_value(
+            "lossless", False, "tell the plant on `recorded` how far the log is; set it on plant and controller, too", fixed=True
+        )
         self.accept_changes()
         self.failure = ""
         self.taps: dict[str, Tap] = {}
@@ -82,6 +88,9 @@ class RecorderNode(LoopNode):
             topic = self.resolve_topic_name(name)
             if self._wanted(topic):
                 self._tap(topic, kind, _expected_qos(name))
+        if self.lossless:
+            self.progress = LogProgress([self.resolve_topic_name(name) for name in ("output", "control_effort")])
+            self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
         self.thread = TapThread(self._current_taps, self._write)
         self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover)
         self.get_logger().info(f"recording to {self.folder}")
@@ -104,6 +113,9 @@ class RecorderNode(LoopNode):
     # What there is to record
 
     def _discover(self) -> None:
+        if self.failure:
+            self._let_go()
+            return
         self.looks += 1
         if self.calm_looks < CALM_LOOKS or self.looks % round(1 / DISCOVERY_PERIOD) == 0:
             self._look()
@@ -176,7 +188,15 @@ class RecorderNode(LoopNode):
                 writer.write(topic_id, data, received_ns, published_ns, sequence)
         except BagError as error:
             self._fail(error)
+            return
         self.counts["recorded"] += len(messages)
+        if self.lossless and self.progress.take(messages):
+            self._tell_progress(self.progress.episode, self.progress.stamp_ns)
+
+    def _tell_progress(self, episode: str, time_ns: int) -> None:
+        message = signal_message(episode)
+        set_stamp(message.header.stamp, time_ns)
+        self.progress_publisher.publish(message)
 
     def _announce(self, writer: BagWriter, tap: Tap) -> int:
         offered = [_profile(info.qos_profile) for info in self.get_publishers_info_by_topic(tap.topic)]
@@ -199,7 +219,8 @@ class RecorderNode(LoopNode):
         self.failure = str(error)
         self.get_logger().error(self.failure)
         self.publish_diagnostics()
-        self.create_timer(0.0, self._let_go)
+        if self.lossless:
+            self._tell_progress(NO_LOG, 0)
 
     def _let_go(self) -> None:
         self.discovery.cancel()

@@ -15,8 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.graph.messages import plan_message, set_stamp, signal_message, stamp_ns
-from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, run_node
-from tdof_npid_ros.graph.plant_node import MODES, STEADY
+from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
 from tdof_npid_ros.scenario import Plan, parse_plan
 
 
@@ -33,11 +32,10 @@ class ScenarioNode(LoopNode):
             self.declare_value("sample_period", 0.01, "s; time of one step", fixed=True)
         )
         self.mode = self.declare_value("mode", "realtime", "lockstep or realtime, as the plant", fixed=True)
-        if self.mode not in MODES:
-            raise ValueError(f"mode is {self.mode!r}: it must be one of {', '.join(MODES)}")
-        self.speed = float(
-            self.declare_value("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
-        )
+        if self.mode not in ("lockstep", "realtime"):
+            raise ValueError(f"mode is {self.mode!r}: it must be one of lockstep, realtime")
+        speed = self.declare_value("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
+        self.speed = number("speed", speed, 1e-3, 1e3)
         self.play_at_start = bool(
             self.declare_value("play", True, "play all episodes at the start; else at scenario/play")
         )
@@ -54,9 +52,9 @@ class ScenarioNode(LoopNode):
         self.current: Plan | None = None
 
     def activate(self) -> None:
-        self.plan_publisher = self.create_publisher(JointTrajectory, "scenario_plan", LATCHED_QOS)
+        self.plan_publisher = self.publisher_of(JointTrajectory, "scenario_plan", LATCHED_QOS)
         self.publishers_of = {
-            name: self.create_publisher(JointState, name, SIGNAL_QOS) for name in ("setpoint", "disturbance")
+            name: self.publisher_of(JointState, name, SIGNAL_QOS) for name in ("setpoint", "disturbance")
         }
         self.create_service(Trigger, "scenario/play", self._on_play)
         self.plant_name = self.resolve_topic_name("plant")
@@ -69,6 +67,9 @@ class ScenarioNode(LoopNode):
             self.create_timer(self.period_ns / 1e9 / self.speed, self._on_tick, clock=STEADY)
         if self.play_at_start:
             self._play()
+
+    def deactivate(self) -> None:
+        self.queue, self.current = [], None
 
     # Playing
 

@@ -7,9 +7,10 @@ then takes whatever has come in the meantime.
 from __future__ import annotations
 
 import importlib
+import struct
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -47,6 +48,7 @@ class Tap:
     Attributes:
         topic_id: in the bag; None until the topic is announced there.
         received: messages taken.
+        missed: messages that the publisher had sent before the subscription reached it.
         lost: messages that DDS reported as lost, or that a gap in the publisher's count shows to be.
     """
 
@@ -55,6 +57,7 @@ class Tap:
         self.qos = qos
         self.topic_id: int | None = None
         self.received = 0
+        self.missed = 0
         self.publishers = 1
         self._reported_lost = self._gaps = 0
         self._next: int | None = None
@@ -107,6 +110,8 @@ class Tap:
     def _count_gaps(self, found: list[Taken]) -> None:
         """Compare the publisher's count with what came; with several publishers, DDS's own reports must do."""
         first, last = found[0].sequence, found[-1].sequence
+        if self._next is None and self.publishers == 1:
+            self.missed = max(0, first - 1)
         whole = last - first == len(found) - 1 and self._next in (None, first)
         if not whole and self.publishers == 1:
             for message in found:
@@ -117,6 +122,40 @@ class Tap:
 
     def _on_lost(self, event: Any) -> None:
         self._reported_lost = event.total_count
+
+
+class LogProgress:
+    """How far the log of some JointState topics is: the stamp that all of them have reached.
+
+    Attributes:
+        episode: the newest outputs' `frame_id`.
+        stamp_ns: of the topic that is furthest behind.
+    """
+
+    def __init__(self, topics: Sequence[str]) -> None:
+        self._latest: dict[str, tuple[str, int]] = {topic: ("", -1) for topic in topics}
+        self.episode, self.stamp_ns = "", -1
+
+    def take(self, messages: Iterable[Taken]) -> bool:
+        """Look at some messages; returns whether there is progress."""
+        newest = {message.tap.topic: message.data for message in messages if message.tap.topic in self._latest}
+        if not newest:
+            return False
+        for topic, data in newest.items():
+            self._latest[topic] = _episode_and_stamp(data)
+        before = self.episode, self.stamp_ns
+        episodes = {episode for episode, _ in self._latest.values()}
+        if len(episodes) == 1:
+            self.episode, self.stamp_ns = episodes.pop(), min(stamp for _, stamp in self._latest.values())
+        return before != (self.episode, self.stamp_ns)
+
+
+def _episode_and_stamp(data: bytes) -> tuple[str, int]:
+    """What a serialized header says: the episode, after the digest of the parameters in an answer, and the stamp."""
+    order = "<" if data[1] else ">"
+    seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
+    text = data[16 : 16 + length - 1].decode(errors="replace")
+    return text.rpartition(" ")[2], seconds * 1_000_000_000 + nanoseconds
 
 
 class TapThread:

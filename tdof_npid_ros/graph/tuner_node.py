@@ -19,7 +19,7 @@ from tdof_npid_ros.case import Case, controller_type, load_case, read_bounds
 from tdof_npid_ros.control.gains import PER_LANE, Gains
 from tdof_npid_ros.graph.loop_pool import OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.graph.messages import signal_message
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, LoopNode, number, spin
+from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, fastest_executor, number
 from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.output_file import check_writable
@@ -144,7 +144,7 @@ class TunerNode(LoopNode):
         """
         while not self.activated.wait(POLL):
             self.check_interrupted()
-        self._report("tuning", "tuning")
+        self.report("tuning", "tuning")
         try:
             with tqdm(
                 total=self.study.budget,
@@ -160,9 +160,9 @@ class TunerNode(LoopNode):
             self.evaluator.leave(self.study.result.gains if self.study.generation else None)
         if self.study.done:
             self._write_result()
-            self._report("finished", f"finished: best {self.study.best_value:.6g}")
+            self.report("finished", f"finished: best {self.study.best_value:.6g}")
         else:
-            self._report("interrupted", self._interrupted())
+            self.report("interrupted", self._interrupted())
 
     def interrupt(self) -> None:
         """Stop at the end of the generation; asked again, or while no loop is in use, at once."""
@@ -173,10 +173,6 @@ class TunerNode(LoopNode):
         """Raise InterruptedTuningError if asked to stop at once."""
         if self.stop_at_once:
             raise InterruptedTuningError(self._interrupted())
-
-    def fail(self, error: Exception) -> None:
-        """Report what ended the run."""
-        self._report("interrupted" if isinstance(error, InterruptedTuningError) else "failed", str(error))
 
     def _after_generation(self, study: Study) -> bool:
         self._publish_progress()
@@ -220,7 +216,8 @@ class TunerNode(LoopNode):
 
     # State
 
-    def _report(self, phase: str, text: str) -> None:
+    def report(self, phase: str, text: str) -> None:
+        """Say on the log and in the diagnostics what the tuner does now."""
         self.phase, self.text = phase, text
         if phase == "failed":
             self.get_logger().error(text)
@@ -240,29 +237,26 @@ class TunerNode(LoopNode):
 def main(args: list[str] | None = None) -> None:
     """Run the node: exit status 0 when finished or interrupted, 2 when it fails."""
     rclpy.init(args=sys.argv if args is None else args, signal_handler_options=SignalHandlerOptions.NO)
-    node, status = None, 0
     try:
-        node = TunerNode()
-        status = _serve(node)
+        status = _serve(TunerNode())
     except (ValueError, OSError) as error:
         print(f"tuner: {error}", file=sys.stderr)
         status = FAILURE
-    finally:
-        rclpy.try_shutdown()
+    rclpy.try_shutdown()
     sys.exit(status)
 
 
 def _serve(node: TunerNode) -> int:
-    """Run the node while another thread spins it."""
-    stopped = threading.Event()
+    """Run the node while another thread spins it; returns the exit status."""
+    stopped, ended = threading.Event(), threading.Event()
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         stopped.set()
         node.interrupt()
 
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, interrupt)
-    spinner = threading.Thread(target=spin, args=(node,), name="spin", daemon=True)
+    for each in STOP_SIGNALS:
+        signal.signal(each, on_signal)
+    spinner = threading.Thread(target=_spin, args=(node, ended), name="spin", daemon=True)
     spinner.start()
     status = 0
     try:
@@ -270,11 +264,22 @@ def _serve(node: TunerNode) -> int:
             node.trigger_configure()
             node.trigger_activate()
         node.run()
+    except InterruptedTuningError as error:
+        node.report("interrupted", str(error))
     except (ValueError, RuntimeError, OSError) as error:
-        node.fail(error)
-        status = 0 if isinstance(error, InterruptedTuningError) else FAILURE
+        node.report("failed", str(error))
+        status = FAILURE
     if node.stay:
         stopped.wait()
-    rclpy.try_shutdown()
+    ended.set()
     spinner.join()
+    node.destroy_node()
     return status
+
+
+def _spin(node: TunerNode, ended: threading.Event) -> None:
+    executor = fastest_executor()
+    executor.add_node(node)
+    while not ended.is_set():
+        executor.spin_once(timeout_sec=POLL)
+    executor.remove_node(node)

@@ -230,6 +230,7 @@ class Reproduction:
         if self.fronts:
             yield from front_statements(self.fronts)
         if self.findings:
+            yield f"{self.findings[0].title}: {self.findings[0].paragraphs[0]}"
             yield (
                 "Puzzles, each with its evidence below: "
                 + "; ".join(finding.title for finding in self.findings[1:])

@@ -25,6 +25,11 @@ class FailSafe:
         self._returned_ns: int | None = None
         self.silent = False
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether an effort has ever come."""
+        return self._latest_ns is not None
+
     def change(self, timeout_ns: int, fallback: float | None, return_ns: int) -> None:
         """Go on with other settings."""
         self._timeout_ns, self._return_ns, self._fallback = timeout_ns, return_ns, fallback

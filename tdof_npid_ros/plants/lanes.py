@@ -45,8 +45,6 @@ def advance_lanes(
     for j in range(lanes):
         u_applied[j] = applied(u[j], limits)
         ring[new * lanes + j] = plant_input(plant, u_applied[j], d[j])
-        state = advance_bounded(
-            plant, loaded(like, x, j, lanes), ring[oldest * lanes + j], ring[due * lanes + j], d[j]
-        )
+        state = advance_bounded(plant, loaded(like, x, j, lanes), ring[oldest * lanes + j], ring[due * lanes + j], d[j])
         store(state, x, j, lanes)
         y[j] = plant_output(plant, state)

@@ -207,5 +207,7 @@ def test_manual_effort_must_fit_the_lanes() -> None:
 
 
 def test_every_operation_has_a_name_of_its_own() -> None:
-    digests = {parameters_digest(GAINS, PERIOD_NS, o) for o in (PLAIN, Operation(dead_band=0.1), Operation(manual=True))}
+    digests = {
+        parameters_digest(GAINS, PERIOD_NS, o) for o in (PLAIN, Operation(dead_band=0.1), Operation(manual=True))
+    }
     assert len(digests) == 3

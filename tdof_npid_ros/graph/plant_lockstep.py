@@ -1,0 +1,167 @@
+"""The plant in lockstep: it publishes an output, waits for its answer, and steps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from tdof_npid_ros.graph.lossless import Log
+from tdof_npid_ros.graph.messages import plan_from_message, set_stamp, stamp_ns, values
+from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, NEWEST_QOS, OK, STEADY, WARN
+from tdof_npid_ros.plants.lockstep import Episode
+from tdof_npid_ros.scenario import Plan
+
+if TYPE_CHECKING:
+    from tdof_npid_ros.graph.plant_node import PlantNode
+
+CLOCK_PERIOD = 0.02  # s of wall time between two /clock messages
+
+
+class LockstepPlant:
+    """Runs the latched plan, episode by episode; takes only the answer to the output that waits for it."""
+
+    def __init__(self, node: PlantNode) -> None:
+        self._node = node
+        self.plan: Plan | None = None
+        self.episode: Episode | None = None
+        self.episodes = 0
+        self.running = self.stopped = False
+
+    def activate(self) -> None:
+        """Create the topics and timers."""
+        node = self._node
+        self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
+        self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
+        node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
+        node.subscribe(JointState, "control_effort", self._on_answer, NEWEST_QOS, sole=True)
+        self.held = False  # an output waits for the log
+        self.log = Log(node, node.output_publisher, node.period_ns, self._on_log_grown) if node.lossless else None
+        timeout = float(node.values_of(["reply_timeout"])["reply_timeout"])
+        node.create_timer(timeout, self._on_reply_timeout, clock=STEADY)
+        if node.get_parameter("publish_clock").value:
+            node.create_timer(CLOCK_PERIOD, self._publish_clock, clock=STEADY)
+
+    def _on_plan(self, message: JointTrajectory) -> None:
+        try:
+            plan = plan_from_message(message)
+            Episode(plan, self._node.simulator, self._node.plant_at, 0)
+        except ValueError as error:
+            self._node.refuse("rejected", f"scenario_plan refused: {error}")
+            return
+        self.plan = plan
+        self._start_episode(plan)
+
+    def reset(self) -> tuple[bool, str]:
+        """The plan once more."""
+        if self.plan is None:
+            return False, "no plan on scenario_plan yet: start the scenario"
+        self._start_episode(self.plan)
+        return True, f"episode {self.episodes} of plan {self.plan.digest} started"
+
+    def _start_episode(self, plan: Plan) -> None:
+        node = self._node
+        self.episodes += 1
+        node.make_simulator()
+        self.episode = Episode(plan, node.simulator, node.plant_at, self.episodes)
+        node.output.header.frame_id = self.episode.name
+        self.running, self.stopped, self.repeats = True, False, 0
+        node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {self.episode.steps} steps")
+        self._publish_when_logged(self.episode)
+        node.publish_diagnostics()
+
+    def _on_answer(self, message: JointState) -> None:
+        node, episode, header = self._node, self.episode, message.header
+        if (
+            episode is None
+            or not (self.running or self.stopped)
+            or not episode.awaits(stamp_ns(header.stamp), header.frame_id)
+        ):
+            node.counts["late"] += 1
+            return
+        if not node.is_sound(message.effort, "control_effort"):
+            return
+        if self.stopped:
+            node.get_logger().info("the controller answers again: going on")
+            self.running, self.stopped = True, False
+        node.counts["steps"] += 1
+        if episode.answer(values(message.effort)):
+            self._publish_when_logged(episode)
+        else:
+            self.running = False
+            node.get_logger().info(f"episode {self.episodes} finished")
+            self._publish_clock()
+            node.publish_diagnostics()
+
+    def _publish_when_logged(self, episode: Episode) -> None:
+        self.held = self.log is not None and not self.log.is_near(episode.name, episode.stamp_ns)
+        if not self.held:
+            self._node.publish_output(episode.stamp_ns)
+
+    def _on_log_grown(self) -> None:
+        if self.held and self.running and self.episode is not None:
+            self._publish_when_logged(self.episode)
+
+    def _on_reply_timeout(self) -> None:
+        node, episode = self._node, self.episode
+        if not self.running or episode is None:
+            return
+        if self.held:
+            self._on_log_grown()
+            if self.held:
+                node.refuse("held_up", "lossless: waiting for the recorder")
+            return
+        waiting = (self.episodes, episode.stamp_ns)
+        if waiting != self.waiting:
+            self.waiting, self.repeats = waiting, 0
+            return
+        if self.repeats >= node.values_of(["retries"])["retries"]:
+            self.running, self.stopped = False, True
+            node.get_logger().error(
+                f"no answer to the output at {episode.stamp_ns / 1e9:g} s after {self.repeats} repetitions: stopped. "
+                "Start a controller in this namespace, or call plant/reset"
+            )
+            node.publish_diagnostics()
+            return
+        if self.repeats == 0:
+            node.get_logger().warning(f"no answer to the output at {episode.stamp_ns / 1e9:g} s: repeating it")
+        self._repeat_output(episode)
+
+    def _repeat_output(self, episode: Episode) -> None:
+        self.repeats += 1
+        self._node.counts["repeated"] += 1
+        self._node.publish_output(episode.stamp_ns)
+
+    def on_matched(self, status: Any) -> None:
+        """A subscriber of `output` has come: if it is the controller, it can go on."""
+        if self.stopped and self.episode is not None and status.current_count_change > 0:
+            self.running, self.stopped, self.repeats = True, False, 0
+            self._repeat_output(self.episode)
+
+    def _publish_clock(self) -> None:
+        if self.episode is not None and self.clock_ns != self.episode.stamp_ns:
+            self.clock_ns = self.episode.stamp_ns
+            message = ClockMessage()
+            set_stamp(message.clock, self.clock_ns)
+            self.clock_publisher.publish(message)
+
+    def changed(self) -> None:
+        """Changed parameters wait for the next episode."""
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """As `LoopNode.state`."""
+        name = "running" if self.running else "stopped" if self.stopped else "finished" if self.episodes else "waiting"
+        facts: dict[str, object] = {
+            "episode": self.episodes,
+            "state": name,
+            "plan": self.plan.digest if self.plan else "",
+        }
+        if self.episode is not None:
+            facts["time_s"] = self.episode.stamp_ns / 1e9
+        if self.stopped:
+            return ERROR, "no controller answers: start one, or call plant/reset", facts
+        if name == "waiting":
+            return WARN, "waiting for a plan on scenario_plan: start the scenario", facts
+        return OK, name, facts

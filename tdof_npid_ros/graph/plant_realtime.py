@@ -1,0 +1,130 @@
+"""The plant in realtime: it steps on a steady timer and takes the newest effort."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.messages import stamp_ns, values
+from tdof_npid_ros.graph.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.timing import LatestTimes, prepare_for_realtime
+from tdof_npid_ros.plants.failsafe import FailSafe
+
+if TYPE_CHECKING:
+    from tdof_npid_ros.graph.plant_node import PlantNode
+
+
+class RealtimePlant:
+    """Steps once per period of wall time; a tick that comes too late is counted and never made up."""
+
+    def __init__(self, node: PlantNode) -> None:
+        self._node = node
+
+    def activate(self) -> None:
+        """Create the topics and the timer."""
+        node = self._node
+        p = node.values_of(["speed", "deadline", "request_deadline", "priority", "cpu"])
+        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
+            node.get_logger().warning(refusal)
+        self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
+        self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
+        self._start()
+        newest = signal_qos(1, p["deadline"] if p["request_deadline"] else 0.0)
+        node.subscribe(JointState, "control_effort", self._on_effort, newest, sole=True)
+        node.subscribe(JointState, "disturbance", self._on_disturbance, signal_qos(1))
+        node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
+
+    def reset(self) -> tuple[bool, str]:
+        """Back to the initial state, at time 0."""
+        self._node.make_simulator()
+        self._start()
+        return True, "at the initial state, time 0"
+
+    def _start(self) -> None:
+        lanes = self._node.simulator.lanes
+        self.disturbance = np.zeros(lanes)
+        self.failsafe = FailSafe(lanes, *self._failsafe_settings())
+        self.step = 0
+        self.first_tick_ns: int | None = None
+        self.output_ns = (0, 0)  # stamp of the latest output, and when it was published
+
+    def _failsafe_settings(self) -> tuple[int, float | None, int]:
+        p = self._node.values_of(["effort_timeout", "fallback", "fallback_effort", "return_time"])
+        fallback = float(p["fallback_effort"]) if p["fallback"] == "effort" else None
+        return round(p["effort_timeout"] * 1e9), fallback, round(p["return_time"] * 1e9)
+
+    def _on_tick(self) -> None:
+        node, now = self._node, STEADY.now().nanoseconds
+        if self.first_tick_ns is None:
+            self.first_tick_ns, self.latest_tick_ns, self.due_ticks = now, now, 0
+        else:
+            self._account_for_tick(now)
+            was_silent = self.failsafe.silent
+            effort = self.failsafe.effort_at(now)
+            if self.failsafe.silent and not was_silent:
+                self._report_silence()
+            node.simulator.advance(effort, self.disturbance)
+            node.counts["steps"] += 1
+            self.step += 1
+        time_ns = self.step * node.period_ns
+        node.publish_output(time_ns)
+        self.output_ns = time_ns, now
+
+    def _account_for_tick(self, now: int) -> None:
+        assert self.first_tick_ns is not None
+        self.period_error.add(abs(now - self.latest_tick_ns - self.wall_period_ns))
+        self.latest_tick_ns = now
+        due = (now - self.first_tick_ns + self.wall_period_ns // 2) // self.wall_period_ns
+        if due > self.due_ticks + 1:
+            self._node.counts["missed_ticks"] += due - self.due_ticks - 1
+        self.due_ticks = max(due, self.due_ticks)
+
+    def _on_effort(self, message: JointState) -> None:
+        if not self._node.is_sound(message.effort, "control_effort"):
+            return
+        now = STEADY.now().nanoseconds
+        stamp, published = self.output_ns
+        if stamp_ns(message.header.stamp) == stamp:
+            self.output_to_effort.add(now - published)
+        if self.failsafe.take(values(message.effort).copy(), now):
+            self._node.get_logger().info("control_effort comes again: going over to it")
+
+    def _report_silence(self) -> None:
+        p = self._node.values_of(["effort_timeout", "fallback", "fallback_effort"])
+        does = f"taking fallback_effort {p['fallback_effort']:g}" if p["fallback"] == "effort" else "holding the last"
+        self._node.counts["silences"] += 1
+        self._node.get_logger().error(f"no control_effort for {p['effort_timeout']:g} s: {does}")
+
+    def _on_disturbance(self, message: JointState) -> None:
+        if len(message.effort) == 1 and self._node.simulator.lanes > 1:
+            message.effort = message.effort * self._node.simulator.lanes
+        if self._node.is_sound(message.effort, "disturbance"):
+            self.disturbance = values(message.effort).copy()
+
+    def on_matched(self, status: Any) -> None:
+        """Nothing waits for subscribers."""
+
+    def changed(self) -> None:
+        """Take over changed parameters."""
+        node = self._node
+        node.simulator.change_plant(node.plant_at({}))
+        node.simulator.effort_limits = node.effort_limits()
+        if node.active:
+            self.failsafe.change(*self._failsafe_settings())
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """As `LoopNode.state`."""
+        facts: dict[str, object] = {
+            "state": "fallback" if self.failsafe.silent else "running",
+            "time_s": self.step * self._node.period_ns / 1e9,
+            **self.period_error.facts("period_error"),
+            **self.output_to_effort.facts("output_to_effort"),
+        }
+        if self.failsafe.silent:
+            return ERROR, "no control_effort: the plant has taken its fallback; start or free the controller", facts
+        if not self.failsafe.is_driven:
+            return WARN, "no control_effort yet: start a controller in this namespace", facts
+        return OK, "running", facts
