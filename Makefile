@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench bench-small clean
 
 demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo
@@ -18,6 +18,9 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
+
+bench-small: $(VENV)/.bench
+	$(BIN)/python -m benchmarks --size small --out $(VENV)/bench-small
 
 $(VENV)/.run: setup.py
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)

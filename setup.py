@@ -14,7 +14,8 @@ by_colcon = "install" in sys.argv or "develop" in sys.argv
 node_scripts = [f"{node} = {NAME}.graph.{node}_node:main" for node in NODES] if by_colcon else []
 
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
-PAPER = ["pymoo>=0.6", "cma>=4"]
+PAPER = ["pymoo>=0.6,<0.7", "cma>=4,<5"]
+BENCH = ["control==0.10.2", "simple-pid==2.0.1", "optuna==5.0.0", "pymoo==0.6.2", "cma==4.5.0"]
 TEST = [
     "pytest>=8", "pytest-timeout", "hypothesis", "ruff", "mypy", "types-PyYAML", "scipy-stubs",
     "rosbags", "mcap-ros2-support",
@@ -41,7 +42,7 @@ setup(
         "numpy>=1.26", "scipy>=1.11", "numba>=0.59", "mpmath>=1.3", "PyYAML>=6", "mcap>=1.1", "zstandard>=0.22",
         "lz4>=4", "matplotlib>=3.6", "tqdm>=4.60",
     ],  # fmt: skip
-    extras_require={"ros": ROS, "paper": PAPER, "test": [*TEST, *PAPER]},
+    extras_require={"ros": ROS, "paper": PAPER, "test": [*TEST, *PAPER], "bench": BENCH},
     entry_points={"console_scripts": [f"tdof-npid = {NAME}.cli:entry", *node_scripts]},
     zip_safe=False,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 import warnings
@@ -27,7 +28,7 @@ WITHIN = 1.001
 Evaluate = Callable[[np.ndarray], np.ndarray]
 
 
-class Reached(Exception):
+class TargetReachedError(Exception):
     """The target was reached."""
 
 
@@ -48,13 +49,14 @@ class Counted:
         self.evaluations, self.reached = 0, None
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:
+        """Values of the candidates, unless the run is over."""
         values = self.evaluate(np.atleast_2d(candidates))
         hits = np.flatnonzero(values <= self.target)
         if hits.size:
             self.reached = self.evaluations + int(hits[0]) + 1
         self.evaluations += len(values)
         if self.reached is not None or self.evaluations >= self.budget:
-            raise Reached
+            raise TargetReachedError
         return values
 
 
@@ -160,10 +162,8 @@ def _one(work: tuple[str, str, str, int]) -> Run:
     objective = Counted(Objective(problem, threads=1), known.objective * WITHIN, budget)
     lower, upper = np.array(problem.bounds).T
     start = time.perf_counter()
-    try:
+    with contextlib.suppress(TargetReachedError):
         optimise(objective, lower, upper, seed)
-    except Reached:
-        pass
     return Run(name, f"{case_name} {controller}", objective.reached, time.perf_counter() - start)
 
 

@@ -100,6 +100,7 @@ class ControllerNode(LoopNode):
         declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
 
     def activate(self) -> None:
+        """Create topics, services and timers."""
         p = self.values_of(["deadline", "lease", "request_deadline", "priority", "cpu"])
         for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
             self.get_logger().warning(refusal)
@@ -123,6 +124,7 @@ class ControllerNode(LoopNode):
             self.create_timer(self.output_timeout_ns / 1e9, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:
+        """Keep what outlasts an inactive time."""
         self.saved_integral = self.controller.integral if self.values_of(["save_i_term"])["save_i_term"] else None
 
     # What arrives
@@ -142,7 +144,7 @@ class ControllerNode(LoopNode):
         if r is None:
             return
         if len(r) not in (1, self.controller.lanes) or not np.isfinite(r).all():
-            self.refuse("rejected", f"setpoint {list(r)[:8]} refused: it must be finite, one value or one per lane")
+            self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
             self.setpoint = r.copy()
 
@@ -270,6 +272,7 @@ class ControllerNode(LoopNode):
     # Parameters and state
 
     def checked(self, changes: dict[str, Any]) -> None:
+        """Refuse changes that do not make a valid whole."""
         self._configured(changes)
         p = {**self.values_of(["setpoint", *SECONDS]), **changes}
         self._setpoint(p["setpoint"])
@@ -277,6 +280,7 @@ class ControllerNode(LoopNode):
             number(name, p[name], low, high)
 
     def changed(self, changes: dict[str, Any]) -> None:
+        """Take over accepted changes."""
         if any(name in DESCRIPTIONS for name in changes):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
@@ -302,6 +306,7 @@ class ControllerNode(LoopNode):
         return np.array([number("setpoint", one, -1e300, 1e300) for one in one_per_lane])
 
     def state(self) -> tuple[int, str, dict[str, object]]:
+        """For the diagnostics."""
         facts: dict[str, object] = {
             "type": self.controller.gains.type,
             "lanes": self.controller.lanes,

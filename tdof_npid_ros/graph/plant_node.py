@@ -87,6 +87,7 @@ class PlantNode(LoopNode):
         declare("cpu", -1, "realtime: number of the processor to stay on; -1: any", fixed=True)
 
     def activate(self) -> None:
+        """Create topics, services and timers."""
         self.output = signal_message("")
         promised = self.values_of(["deadline", "lease"])
         deadline = promised["deadline"] if self.mode == "realtime" else 0.0
@@ -134,6 +135,7 @@ class PlantNode(LoopNode):
     # Parameters and state
 
     def checked(self, changes: dict[str, Any]) -> None:
+        """Refuse changes that do not make a valid whole."""
         p = {**self.values_of([*self.model_names, "lanes", "effort_min", "effort_max", "fallback", *RANGES]), **changes}
         if self.mode not in MODES:
             raise ValueError(f"mode is {self.mode!r}: it must be one of {', '.join(MODES)}")
@@ -150,9 +152,11 @@ class PlantNode(LoopNode):
             )
 
     def changed(self, changes: dict[str, Any]) -> None:
+        """Take over accepted changes."""
         self.way_of_running.changed()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
+        """For the diagnostics."""
         level, text, facts = self.way_of_running.state()
         return level, text, {"mode": self.mode, "lanes": self.simulator.lanes, **facts}
 

@@ -52,6 +52,7 @@ class ScenarioNode(LoopNode):
         self.current: Plan | None = None
 
     def activate(self) -> None:
+        """Create topics, services and timers."""
         self.plan_publisher = self.publisher_of(JointTrajectory, "scenario_plan", LATCHED_QOS)
         self.publishers_of = {
             name: self.publisher_of(JointState, name, SIGNAL_QOS) for name in ("setpoint", "disturbance")
@@ -69,6 +70,7 @@ class ScenarioNode(LoopNode):
             self._play()
 
     def deactivate(self) -> None:
+        """Forget the episode that is being played."""
         self.queue, self.current = [], None
 
     # Playing
@@ -168,6 +170,7 @@ class ScenarioNode(LoopNode):
             self.plans[name] = parse_plan(lines, self.period_ns)
 
     def checked(self, changes: dict[str, Any]) -> None:
+        """Refuse changes that do not make a valid whole."""
         before = self.plans
         try:
             self._read_plans(changes)
@@ -175,9 +178,11 @@ class ScenarioNode(LoopNode):
             self.plans = before
 
     def changed(self, changes: dict[str, Any]) -> None:
+        """Take over accepted changes."""
         self._read_plans(changes)
 
     def state(self) -> tuple[int, str, dict[str, object]]:
+        """For the diagnostics."""
         facts: dict[str, object] = {"state": "playing" if self.current else "idle", "played": self.played}
         if self.current:
             facts["plan"] = self.current.digest

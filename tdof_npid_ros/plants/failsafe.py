@@ -61,4 +61,4 @@ class FailSafe:
         if passed >= self._return_ns:
             self._returned_ns = None
             return self._effort
-        return self._from + (self._effort - self._from) * (passed / self._return_ns)
+        return np.asarray(self._from + (self._effort - self._from) * (passed / self._return_ns))

@@ -14,6 +14,7 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 
+PERIOD_NS = 5_000_000
 SHORT = {
     "p1-c0.5": ("0 setpoint 1", "0.5 disturbance 0.5", "1.5 end"),
     "sprott": ("0 setpoint 1", "0 plant.a 0.6", "0.2 plant.a 0.72", "0.5 end"),
@@ -108,19 +109,20 @@ def test_bad_start_parameters_are_one_line_and_status_2(
     assert len(lines) == 1 and reason in lines[0], process.log
 
 
+@pytest.fixture(scope="module")
+def loop(shared_graph: Any) -> Any:
+    from sensor_msgs.msg import JointState
+
+    shared_graph.process = shared_graph.start("controller", case="p1-c0.5", namespace="/c")
+    shared_graph.efforts = shared_graph.collect("/c/control_effort", JointState)
+    shared_graph.output = shared_graph.publisher("/c/output", JointState)
+    shared_graph.time_ns = 0
+    shared_graph.wait_for_nodes("/c/controller")
+    return shared_graph
+
+
 class TestController:
     """Refusals of one controller that goes on."""
-
-    @pytest.fixture(scope="class")
-    def loop(self, shared_graph: Any) -> Any:
-        from sensor_msgs.msg import JointState
-
-        shared_graph.process = shared_graph.start("controller", case="p1-c0.5", namespace="/c")
-        shared_graph.efforts = shared_graph.collect("/c/control_effort", JointState)
-        shared_graph.output = shared_graph.publisher("/c/output", JointState)
-        shared_graph.time_ns = 0
-        shared_graph.wait_for_nodes("/c/controller")
-        return shared_graph
 
     def answer(self, loop: Any, *position: float) -> Any:
         publish_output(loop, *position)
@@ -157,19 +159,18 @@ class TestController:
         assert loop.set_parameters("/c/controller", effort_max=50)[0].successful
         loop.wait_for_log(loop.process, "effort_max: inf -> 50")
 
-    @pytest.mark.parametrize("bad", [(math.nan,), (math.inf,), (), (1.0, 2.0)])
-    def test_bad_outputs_are_counted_and_change_nothing(self, loop: Any, bad: tuple[float, ...]) -> None:
+    def test_bad_outputs_are_counted_and_change_nothing(self, loop: Any) -> None:
         self.answer(loop, 0.1)
-        rejected = int(loop.fact("/c/controller", "rejected", 0))
         answered, latest = len(loop.efforts), loop.efforts[-1]
-        for _ in range(20):
+        stamp_ns = loop.time_ns
+        for bad in ((math.nan,), (-math.inf,), (), (1.0, 2.0)):
+            rejected = int(loop.fact("/c/controller", "rejected", 0))
             publish_output(loop, *bad)
-        loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 20, what="20 rejections")
+            loop.wait_until(lambda n=rejected: int(loop.fact("/c/controller", "rejected", 0)) > n, what="a rejection")
         assert len(loop.efforts) == answered
-        loop.time_ns -= 20 * 5_000_000
-        loop.time_ns -= 5_000_000
+        loop.time_ns = stamp_ns - PERIOD_NS
         assert self.answer(loop, 0.1).effort == latest.effort  # the same stamp again: no state has advanced
-        loop.wait_until(lambda: "refused (further ones are only counted" in loop.process.log)
+        assert loop.process.log.count("output that is not finite refused") == 1
 
     def test_bad_setpoints_are_refused(self, loop: Any) -> None:
         from sensor_msgs.msg import JointState
@@ -216,7 +217,7 @@ class TestController:
 def publish_output(loop: Any, *position: float) -> None:
     from sensor_msgs.msg import JointState
 
-    loop.time_ns += 5_000_000
+    loop.time_ns += PERIOD_NS
     message = JointState(position=position)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(loop.time_ns, 1_000_000_000)
     loop.output.publish(message)

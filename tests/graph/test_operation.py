@@ -1,0 +1,184 @@
+"""What an operator may do to the running nodes: life cycle, live changes, manual mode, joints, a restored dump."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+
+PLANT = {"mode": "realtime", "model": "first_order", "time_constant": 0.5, "dead_time": 0.0, "sample_period": 0.01}
+CONTROLLER = {
+    "sample_period": 0.01,
+    "type": "tdof_npid2",
+    "kp": 2.0,
+    "ki": 4.0,
+    "kd": 0.02,
+    "alpha": 0.2,
+    "setpoint": 1.0,
+}
+
+
+class Live:
+    """A realtime loop in a namespace of its own, watched."""
+
+    def __init__(self, graph: Any, namespace: str, plant: dict[str, Any], controller: dict[str, Any]) -> None:
+        from sensor_msgs.msg import JointState
+
+        self.graph, self.namespace = graph, namespace
+        self.controller_name, self.plant_name = f"{namespace}/controller", f"{namespace}/plant"
+        self.outputs = graph.collect(f"{namespace}/output", JointState)
+        self.efforts = graph.collect(f"{namespace}/control_effort", JointState)
+        self.plant = graph.start("plant", namespace=namespace, **{**PLANT, **plant})
+        self.controller = graph.start("controller", namespace=namespace, **{**CONTROLLER, **controller})
+
+    def settle(self, y: float = 1.0, tolerance: float = 0.05) -> None:
+        """Wait until the output has stayed at `y` for 30 samples from now on."""
+        first = len(self.outputs)
+        self.graph.wait_until(
+            lambda: len(self.outputs) > first + 30 and np.allclose(self.latest_y(30), y, atol=tolerance),
+            30,
+            f"the output to settle at {y}",
+        )
+
+    def latest_y(self, count: int) -> list[float]:
+        return [message.position[0] for message in self.outputs[-count:]]
+
+    def wait_for_efforts(self, count: int) -> list[float]:
+        """The next `count` efforts."""
+        first = len(self.efforts)
+        self.graph.wait_until(lambda: len(self.efforts) >= first + count, 30, f"{count} efforts")
+        return [message.effort[0] for message in self.efforts[first:]]
+
+
+@pytest.fixture(scope="module")
+def live(shared_graph: Any) -> Live:
+    loop = Live(shared_graph, "/live", {}, {})
+    loop.settle()
+    return loop
+
+
+def largest_step(efforts: list[float]) -> float:
+    return float(np.max(np.abs(np.diff(efforts))))
+
+
+@pytest.mark.parametrize(
+    "change", [{"kp": 6.0}, {"ki": 8.0}, {"kd": 0.2}, {"alpha": 0.9}, {"sigma": 0.3}, {"kp": 2.0, "kd": 0.0}], ids=str
+)
+def test_gains_change_without_a_jump(live: Live, change: dict[str, Any]) -> None:
+    before = [live.efforts[-1].effort[0]]
+    (result,) = live.graph.set_parameters(live.controller_name, atomically=True, **change)
+    assert result.successful
+    assert largest_step(before + live.wait_for_efforts(10)) < 0.05
+
+
+@pytest.mark.parametrize("kind", CONTROLLER_TYPES)
+def test_the_type_changes_without_a_jump(live: Live, kind: str) -> None:
+    before = [live.efforts[-1].effort[0]]
+    assert live.graph.set_parameters(live.controller_name, type=kind)[0].successful
+    assert largest_step(before + live.wait_for_efforts(10)) < 0.05
+
+
+def test_manual_mode_by_topic_and_bumpless_return(live: Live) -> None:
+    from sensor_msgs.msg import JointState
+
+    live.settle()
+    by_hand = live.graph.publisher("/live/manual_effort", JointState)
+    assert live.graph.set_parameters(live.controller_name, atomically=True, manual=True, manual_effort=1.1)[
+        0
+    ].successful
+    live.graph.wait_until(lambda: live.efforts[-1].effort[0] == 1.1, what="the parameter's effort")
+    by_hand.publish(JointState(effort=[0.9]))
+    live.graph.wait_until(lambda: live.efforts[-1].effort[0] == 0.9, what="the topic's effort")
+    live.settle(0.9, 0.1)
+    before = [live.efforts[-1].effort[0]]
+    assert live.graph.set_parameters(live.controller_name, manual=False)[0].successful
+    assert largest_step(before + live.wait_for_efforts(20)) < 0.1
+    live.settle()
+
+
+def test_inactive_publishes_nothing_and_comes_back_without_a_jump(live: Live) -> None:
+    from sensor_msgs.msg import JointState  # noqa: F401
+
+    live.settle()
+    assert live.graph.set_parameters(live.plant_name, fallback="hold")[0].successful
+    assert live.graph.change_state(live.controller_name, "deactivate")
+    live.graph.wait_until(lambda: live.graph.node.count_publishers("/live/control_effort") == 0, what="silence")
+    live.graph.wait_until(lambda: live.graph.fact(live.plant_name, "state") == "fallback", what="the plant's fallback")
+    assert "inactive" in live.graph.fact(live.controller_name, "message")
+    count, applied = len(live.efforts), live.outputs[-1].effort[0]
+    for _ in range(2):  # and once more: activation and deactivation leave nothing behind
+        assert live.graph.change_state(live.controller_name, "activate")
+        live.wait_for_efforts(5)
+        assert live.graph.change_state(live.controller_name, "deactivate")
+    assert live.graph.change_state(live.controller_name, "activate")
+    efforts = live.wait_for_efforts(5)
+    assert largest_step([applied, live.efforts[count].effort[0], *efforts]) < 0.1
+    live.settle()
+
+
+def test_a_held_controller_waits_for_its_supervisor(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    graph.start("controller", autostart=False, **CONTROLLER)
+    graph.wait_for_nodes("/controller")
+    assert graph.node.count_subscribers("/output") == 0
+    assert graph.change_state("/controller", "configure")
+    assert graph.change_state("/controller", "activate")
+    output = graph.publisher("output", JointState)
+    output.publish(JointState(position=[0.0]))
+    graph.wait_until(lambda: efforts, what="an effort")
+
+
+def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start("controller", "-r", "output:=joint_states", kp=[2.0, 3.0],
+                             joint_names=["elbow", "wrist"], setpoint=[1.0, 2.0])  # fmt: skip
+    joint_states = graph.publisher("joint_states", JointState)
+    message = JointState(name=["base", "wrist", "elbow"], position=[9.0, 1.5, 0.25], velocity=[0.0] * 3)
+    message.header.frame_id = "base_link"
+    joint_states.publish(message)
+    graph.wait_until(lambda: efforts, what="an effort")
+    assert list(efforts[0].name) == ["elbow", "wrist"]
+    assert list(efforts[0].effort) == [2.0 * 0.75, 3.0 * 0.5]
+    joint_states.publish(JointState(name=["base", "elbow"], position=[0.0, 0.0]))
+    graph.wait_for_log(controller, "has no joint wrist")
+
+
+def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
+    from rcl_interfaces.srv import ListParameters
+
+    graph.start(
+        "controller", namespace="/a", kp=[2.5, 3.0], ki=0.3, type="npid", effort_max=4.0, manual_effort=[1.0, 2.0]
+    )
+    graph.wait_for_nodes("/a/controller")
+    assert graph.set_parameters("/a/controller", dead_band=0.25)[0].successful
+    names = list(graph.call("/a/controller/list_parameters", ListParameters).result.names)
+    values = graph.get_parameters("/a/controller", *names)
+    plain = [list(value) if hasattr(value, "__len__") and not isinstance(value, str) else value for value in values]
+    file = graph.folder / "dump.yaml"  # as `ros2 param dump /a/controller` writes it
+    file.write_text(yaml.dump({"/b/controller": {"ros__parameters": dict(zip(names, plain, strict=True))}}))
+    graph.start("controller", "--params-file", str(file), namespace="/b")
+    graph.wait_for_nodes("/b/controller")
+    assert graph.get_parameters("/b/controller", *names) == values
+    graph.wait_for_nodes("/a/controller")
+    assert graph.fact("/b/controller", "parameters") == graph.fact("/a/controller", "parameters")
+
+
+def test_a_second_publisher_and_a_profile_that_does_not_fit_are_reported(graph: Any) -> None:
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+
+    controller = graph.start("controller", **CONTROLLER)
+    graph.publisher("output", JointState)
+    graph.publisher("output", JointState)
+    graph.wait_until(lambda: "/output has 2 publishers (/test, /test)" in graph.fact("/controller", "message"))
+    graph.node.create_publisher(JointState, "setpoint", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.wait_for_log(controller, "/setpoint: /test offers best_effort, volatile, but /controller requests reliable")
+    assert int(graph.fact("/controller", "conflicts")) >= 1

@@ -1,0 +1,47 @@
+"""The realtime plant keeps time: absolute schedule, missed ticks, speed, figures in the diagnostics, an idle tick's cost."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from test_operation import Live
+
+SOAK_SECONDS = float(os.environ.get("TDOF_SOAK_SECONDS", "20"))
+WARM_UP_SECONDS = min(60.0, SOAK_SECONDS / 2)
+
+
+def test_figures_and_speed(graph: Any) -> None:
+    """At speed 5, 100 Hz of simulated time are 500 ticks a second; none is made up, none is lost."""
+    live = Live(graph, "/fast", {"speed": 5.0}, {})
+    live.settle()
+    first, began = int(graph.fact("/fast/plant", "steps", 0)), time.monotonic()
+    graph.wait_until(lambda: time.monotonic() - began > 2.0 and int(graph.fact("/fast/plant", "steps", 0)) > first)
+    graph.wait_until(lambda: graph.fact("/fast/plant", "output_to_effort_p99_us"), what="the figures")
+    for figure in ("period_error_p50_us", "period_error_p99_us", "output_to_effort_p50_us"):
+        assert 0.0 <= float(graph.fact("/fast/plant", figure)) < 1e6
+    stamps = [m.header.stamp.sec * 1e9 + m.header.stamp.nanosec for m in live.outputs]
+    assert set(b - a for a, b in zip(stamps, stamps[1:], strict=False)) == {10_000_000}
+
+
+def test_soak_at_200_hz(graph: Any) -> None:
+    """No answer is missed and memory stays flat; TDOF_SOAK_SECONDS=600 is the long version."""
+    live = Live(graph, "/soak", {"sample_period": 0.005}, {"sample_period": 0.005})
+    live.settle()
+
+    def resident_kib(process: Any) -> int:
+        status = Path(f"/proc/{process.process.pid}/status").read_text()
+        return int(status.split("VmRSS:")[1].split()[0])
+
+    began = time.monotonic()
+    graph.wait_until(lambda: time.monotonic() - began > WARM_UP_SECONDS, SOAK_SECONDS + 30)
+    before = {process.node: resident_kib(process) for process in (live.plant, live.controller)}
+    first = len(live.outputs)
+    graph.wait_until(lambda: time.monotonic() - began > SOAK_SECONDS, SOAK_SECONDS + 30)
+    for process in (live.plant, live.controller):
+        assert resident_kib(process) - before[process.node] < 1024, process.node
+    answered = {(m.header.stamp.sec, m.header.stamp.nanosec) for m in live.efforts}
+    unanswered = [m for m in live.outputs[first:-20] if (m.header.stamp.sec, m.header.stamp.nanosec) not in answered]
+    assert len(unanswered) == 0
