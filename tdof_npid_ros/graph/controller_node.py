@@ -22,7 +22,18 @@ from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_map
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.messages import NO_VALUES, as_field, plan_from_message, signal_message, stamp_ns, values
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.node import (
+    ERROR,
+    LATCHED_QOS,
+    OK,
+    RECENT,
+    SIGNAL_QOS,
+    STEADY,
+    WARN,
+    LoopNode,
+    number,
+    run_node,
+)
 from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.scenario import Plan
 
@@ -113,13 +124,13 @@ class ControllerNode(LoopNode):
         self.effort_for = ("", "")
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
-        newest = signal_qos(1, p["deadline"] if p["request_deadline"] else 0.0)
+        recent = signal_qos(RECENT, p["deadline"] if p["request_deadline"] else 0.0)
         self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
         self.subscribe(JointState, "manual_effort", self._on_manual_effort, signal_qos(1))
-        self.subscribe(JointState, "output", self._on_output, newest, sole=True)
+        self.subscribe(JointState, "output", self._on_output, recent, sole=True)
         if self.output_timeout_ns:
             self.create_timer(self.output_timeout_ns / 1e9, self._look_for_silence, clock=STEADY)
 
@@ -133,7 +144,7 @@ class ControllerNode(LoopNode):
         try:
             plan = plan_from_message(message)
         except ValueError as error:
-            self.refuse("rejected", f"scenario_plan refused: {error}")
+            self.refuse("rejected", "scenario_plan refused", f": {error}")
             return
         self.plan = plan
         if self.waiting is not None:
@@ -225,13 +236,13 @@ class ControllerNode(LoopNode):
         try:
             return self.joints.picked(names, values(field))
         except ValueError as error:
-            self.refuse("rejected", f"{topic} refused: it {error}")
+            self.refuse("rejected", f"{topic} refused", f": it {error}")
             return None
 
     def _is_sound(self, y: np.ndarray) -> bool:
         lanes = self.controller.lanes
         if len(y) != lanes:
-            self.refuse("rejected", f"output with {len(y)} values refused: the gains are for {lanes} lanes")
+            self.refuse("rejected", "output refused", f": it has {len(y)} values, the gains are for {lanes} lanes")
         elif not (math.isfinite(y[0]) if lanes == 1 else np.isfinite(y).all()):
             self.refuse("rejected", "output that is not finite refused")
         else:

@@ -55,9 +55,7 @@ class Endpoints:
         self._sole.clear()
         self.conflicts = []
 
-    def publisher_events(
-        self, topic: str, matched: Callable[[Any], None] | None = None
-    ) -> PublisherEventCallbacks:
+    def publisher_events(self, topic: str, matched: Callable[[Any], None] | None = None) -> PublisherEventCallbacks:
         """The callbacks for a publisher that this node is about to create."""
         self._published.add(self._node.resolve_topic_name(topic))
 

@@ -25,7 +25,8 @@ from tdof_npid_ros.graph.messages import diagnostics_message
 from tdof_npid_ros.graph.timing import collect_garbage
 
 SIGNAL_QOS = signal_qos(1000)
-NEWEST_QOS = signal_qos(1)  # of subscriptions for which only the newest message counts
+RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
+RECENT_QOS = signal_qos(RECENT)
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
@@ -128,12 +129,12 @@ class LoopNode(LifecycleNode):
 
     # Reporting
 
-    def refuse(self, count: str, cause: str) -> None:
-        """Count something that was refused, and log it the first time for each cause."""
+    def refuse(self, count: str, cause: str, detail: str = "") -> None:
+        """Count something that was refused; the first time for each cause, log it with its detail."""
         self.counts[count] += 1
         if cause not in self._warned:
             self._warned.add(cause)
-            self.get_logger().warning(f"{cause} (further ones are only counted, as {count!r} in /diagnostics)")
+            self.get_logger().warning(f"{cause}{detail} (further ones are only counted, as {count!r} in /diagnostics)")
 
     def publish_diagnostics(self) -> None:
         """Publish the node's state and counts now; it happens once a second anyway."""
@@ -162,6 +163,7 @@ class LoopNode(LifecycleNode):
             self._destroy_what_activate_created()
             return TransitionCallbackReturn.FAILURE
         self.active = True
+        self.publish_diagnostics()
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -169,6 +171,7 @@ class LoopNode(LifecycleNode):
         self.active = False
         self.deactivate()
         self._destroy_what_activate_created()
+        self.publish_diagnostics()
         return super().on_deactivate(state)
 
     def _entities(self) -> list[tuple[Callable[[Any], bool], Any]]:

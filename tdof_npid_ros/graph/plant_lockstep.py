@@ -10,7 +10,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.graph.lossless import Log
 from tdof_npid_ros.graph.messages import plan_from_message, set_stamp, stamp_ns, values
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, NEWEST_QOS, OK, STEADY, WARN
+from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
 
@@ -36,7 +36,7 @@ class LockstepPlant:
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        node.subscribe(JointState, "control_effort", self._on_answer, NEWEST_QOS, sole=True)
+        node.subscribe(JointState, "control_effort", self._on_answer, RECENT_QOS, sole=True)
         self.held = False  # an output waits for the log
         self.log = Log(node, node.output_publisher, node.period_ns, self._on_log_grown) if node.lossless else None
         timeout = float(node.values_of(["reply_timeout"])["reply_timeout"])
@@ -49,7 +49,7 @@ class LockstepPlant:
             plan = plan_from_message(message)
             Episode(plan, self._node.simulator, self._node.plant_at, 0)
         except ValueError as error:
-            self._node.refuse("rejected", f"scenario_plan refused: {error}")
+            self._node.refuse("rejected", "scenario_plan refused", f": {error}")
             return
         self.plan = plan
         self._start_episode(plan)

@@ -107,7 +107,7 @@ class PlantNode(LoopNode):
         """Whether a message's field has one finite value per lane; else it is refused."""
         lanes = self.simulator.lanes
         if len(field) != lanes:
-            self.refuse("rejected", f"{topic} with {len(field)} values for {lanes} lanes refused")
+            self.refuse("rejected", f"{topic} refused", f": it has {len(field)} values for {lanes} lanes")
         elif not (math.isfinite(field[0]) if lanes == 1 else np.isfinite(values(field)).all()):
             self.refuse("rejected", f"{topic} that is not finite refused")
         else:

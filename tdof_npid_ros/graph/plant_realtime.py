@@ -9,7 +9,7 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.messages import stamp_ns, values
-from tdof_npid_ros.graph.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.node import ERROR, OK, RECENT, STEADY, WARN
 from tdof_npid_ros.graph.timing import LatestTimes, prepare_for_realtime
 from tdof_npid_ros.plants.failsafe import FailSafe
 
@@ -32,8 +32,8 @@ class RealtimePlant:
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
         self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
         self._start()
-        newest = signal_qos(1, p["deadline"] if p["request_deadline"] else 0.0)
-        node.subscribe(JointState, "control_effort", self._on_effort, newest, sole=True)
+        recent = signal_qos(RECENT, p["deadline"] if p["request_deadline"] else 0.0)
+        node.subscribe(JointState, "control_effort", self._on_effort, recent, sole=True)
         node.subscribe(JointState, "disturbance", self._on_disturbance, signal_qos(1))
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
 

@@ -59,11 +59,19 @@ class RemoteNode:
             TuningError: refused, with the node's reason.
             LoopLostError: no answer.
         """
-        request = SetParametersAtomically.Request()
-        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        result = self.call(SetParametersAtomically, f"{self.name}/set_parameters_atomically", request).result
+        result = self.call(*self._setting(values)).result
         if not result.successful:
             raise TuningError(f"{self.name} refused {', '.join(values)}: {result.reason}")
+
+    def request_parameters(self, values: Mapping[str, Any]) -> None:
+        """Ask for parameters to be set, without waiting for the answer."""
+        kind, service, request = self._setting(values)
+        self._client(kind, service).call_async(request)
+
+    def _setting(self, values: Mapping[str, Any]) -> tuple[Any, str, Any]:
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        return SetParametersAtomically, f"{self.name}/set_parameters_atomically", request
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """The answer of a service.
@@ -71,9 +79,7 @@ class RemoteNode:
         Raises:
             LoopLostError: no answer.
         """
-        client = self._clients.get(service)
-        if client is None:
-            client = self._clients[service] = self._node.create_client(kind, service)
+        client = self._client(kind, service)
         end = time.monotonic() + self._answer_timeout
         while time.monotonic() < end:
             self._check()
@@ -87,3 +93,8 @@ class RemoteNode:
                 return future.result()
             client.remove_pending_request(future)
         raise LoopLostError(f"{service} did not answer within {self._answer_timeout:g} s")
+
+    def _client(self, kind: Any, service: str) -> Any:
+        if service not in self._clients:
+            self._clients[service] = self._node.create_client(kind, service)
+        return self._clients[service]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import threading
@@ -17,10 +18,12 @@ from tqdm import tqdm
 
 from tdof_npid_ros.case import Case, controller_type, load_case, read_bounds
 from tdof_npid_ros.control.gains import PER_LANE, Gains
-from tdof_npid_ros.graph.loop_pool import OWN_LOOP, LoopPool, candidate_of
+from tdof_npid_ros.graph.alternate_loop import AlternateLoop
+from tdof_npid_ros.graph.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.graph.messages import signal_message
 from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, fastest_executor, number
 from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
+from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.output_file import check_writable
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -29,6 +32,7 @@ from tdof_npid_ros.tuning.study import Study
 POPULATION, GENERATIONS = 40, 60  # by default: lanes of a generation, and a run of a minute or two
 POLL = 0.05  # s between two looks for a signal
 FAILURE = 2  # exit status
+EPISODE = ("reset", "alternate")
 
 
 class InterruptedTuningError(RuntimeError):
@@ -69,6 +73,7 @@ class TunerNode(LoopNode):
         checkpoint = self._declare_path("checkpoint", "file, saved after each generation")
         resume = self.declare_value("resume", True, "go on from the checkpoint if it is there", fixed=True)
         self.result_file = self._declare_path("result", "ROS parameter file to write the optimum to")
+        self.step_test = self._declare_step_test()
         self.stay = self.declare_value("stay", False, "stay on the graph when done, instead of ending", fixed=True)
         if self.result_file is not None:
             check_writable(self.result_file)
@@ -76,14 +81,20 @@ class TunerNode(LoopNode):
         self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"
 
     def activate(self) -> None:
+        """Look for the loops, and let `run` begin."""
         self.progress = signal_message("")
         self.progress_publisher = self.create_publisher(JointState, "tuning_progress", LATCHED_QOS)
-        self.evaluator: Evaluator = LoopPool(
-            self, self.problem, self.loops, self.loop_timeout, self.answer_timeout, self.check_interrupted
-        )
+        timeouts = self.loop_timeout, self.answer_timeout
+        self.evaluator: Evaluator
+        if self.step_test is None:
+            self.evaluator = LoopPool(self, self.problem, self.loops, *timeouts, self.check_interrupted)
+        else:
+            loop = self.get_namespace() if self.loops == [OWN_LOOP] else self.loops[0]
+            self.evaluator = AlternateLoop(self, self.problem, self.step_test, loop, *timeouts, self.check_interrupted)
         self.activated.set()
 
     def deactivate(self) -> None:
+        """Stop, as at a signal."""
         self.interrupt()
 
     # Parameters
@@ -126,6 +137,31 @@ class TunerNode(LoopNode):
         }
         return replace(case, bounds=bounds)
 
+    def _declare_step_test(self) -> StepTest | None:
+        """How candidates are tested on a plant that cannot be reset; None for one in lockstep."""
+        episode = self.declare_value("episode", "reset", f"how a candidate is tested: {', '.join(EPISODE)}", fixed=True)
+        if episode not in EPISODE:
+            raise ParameterFileError(f"episode is {episode!r}: it must be one of {', '.join(EPISODE)}")
+        levels = self._declare_pair("levels", [0.0, 1.0], "alternate: the two setpoints")
+        safe_output = self._declare_pair("safe_range.output", [-math.inf, math.inf], "alternate: ends a trial if left")
+        safe_effort = self._declare_pair("safe_range.effort", [-math.inf, math.inf], "alternate: ends a trial if left")
+        settle_band = self.declare_value(
+            "settle_band", 0.02, "alternate: share of the step, counts as there", fixed=True
+        )
+        settle_time = self._declare_seconds("settle_time", 1.0, "alternate: s within settle_band, counts as settled")
+        time_limit = self._declare_seconds("time_limit", 60.0, "alternate: s in which the output must settle")
+        if episode == "reset":
+            return None
+        if len(self.loops) != 1 or EVERY_LOOP in self.loops:
+            raise ParameterFileError(f"loops are {self.loops}: episode alternate tunes one loop, name that one")
+        return StepTest(levels, number("settle_band", settle_band), settle_time, time_limit, safe_output, safe_effort)
+
+    def _declare_pair(self, name: str, default: list[float], description: str) -> tuple[float, float]:
+        value = self.declare_value(name, default, description, fixed=True)
+        if not isinstance(value, list) or len(value) != 2:
+            raise ParameterFileError(f"{name} is {value!r}: it must be two numbers")
+        return number(name, value[0]), number(name, value[1])
+
     def _declare_path(self, name: str, what: str) -> Path | None:
         value = str(self.declare_value(name, "", f"{what}; empty: none", fixed=True))
         return Path(value) if value else None
@@ -153,7 +189,7 @@ class TunerNode(LoopNode):
                 disable=not sys.stderr.isatty(),
             ) as self.bar:
                 self.study.run(self.evaluator.evaluate, self._after_generation)
-            if self.study.done:
+            if self.study.done and self.step_test is None:
                 self._confirm()
         finally:
             self.stop_at_once = False
@@ -226,6 +262,7 @@ class TunerNode(LoopNode):
         self.publish_diagnostics()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
+        """The phase (waiting, tuning, finished, interrupted, failed) and how far the run is."""
         facts: dict[str, object] = {"state": self.phase}
         if self.activated.is_set():
             study = self.study

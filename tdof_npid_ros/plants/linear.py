@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +14,8 @@ from tdof_npid_ros.plants.kernels import SampledLinear
 from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
+
+_PRECISION = threading.Lock()  # mpmath's precision belongs to the whole process
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def _sample(
     and v[k-delay] for the rest: both contributions are blocks of exp([[A, B], [0, 0]] t).
     """
     delay, late_ns = divmod(dead_time_ns, period_ns)
-    with mpmath.workdps(DIGITS):
+    with _PRECISION, mpmath.workdps(DIGITS):
         period, late = mpmath.mpf(period_ns) / 10**9, mpmath.mpf(late_ns) / 10**9
         a, b = _observable_form(numerator, denominator)
         _, gamma_new = _hold(a, b, period - late)

@@ -42,9 +42,7 @@ L = TypeVar("L", bound=LiveLoop)
 
 def integrals_of(signals: Signals, output: Array) -> Integrals:
     """The integrals of an episode from its outputs (steps + 1, lanes): the same bits as `loop.integrals`."""
-    error = np.abs(signals.setpoint[:, None] - output)
-    error[0] *= 0.5
-    error[-1] *= 0.5
+    error = signals.weight[:, None] * np.abs(signals.setpoint[:, None] - output)
     iae = np.cumsum(error, axis=0)[-1] * (signals.sample_period_ns / 1e9)  # a sum in the order of time
     sound = np.count_nonzero(np.abs(output) < SOUND_OUTPUT, axis=0)
     return Integrals(iae, sound / (signals.steps + 1))

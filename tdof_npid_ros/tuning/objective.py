@@ -63,7 +63,6 @@ class Objective:
         self._problem = problem
         self._threads = threads or available_cores()
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="objective")
-        self._sample_plant()
 
     def __call__(self, candidates: Array) -> Array:
         """Values (n,) of candidates (n, len(problem.names)).
@@ -73,13 +72,6 @@ class Objective:
         """
         setpoint, disturbance = self.integrals(candidates)
         return objective_values(setpoint, disturbance, self._problem.weight)
-
-    def _sample_plant(self) -> None:
-        """Discretise the plant now: mpmath's precision is global, so threads must find it done."""
-        case = self._problem.case
-        for episode in EPISODES:
-            for segment in case.signals[episode].segments:
-                case.plant_at(segment.plant).sampled(case.sample_period_ns)
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
         """Of the setpoint and the disturbance episode, (n,) each."""

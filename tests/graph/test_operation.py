@@ -36,12 +36,16 @@ class Live:
         self.controller = graph.start("controller", namespace=namespace, **{**CONTROLLER, **controller})
 
     def settle(self, y: float = 1.0, tolerance: float = 0.05) -> None:
-        """Wait until the output has stayed at `y` for 30 samples from now on."""
-        first = len(self.outputs)
+        """Wait until the loop runs and its output has stayed at `y` for 30 samples from now on."""
+        outputs, efforts = len(self.outputs) + 30, len(self.efforts) + 30
         self.graph.wait_until(
-            lambda: len(self.outputs) > first + 30 and np.allclose(self.latest_y(30), y, atol=tolerance),
+            lambda: (
+                len(self.outputs) > outputs
+                and len(self.efforts) > efforts
+                and np.allclose(self.latest_y(30), y, atol=tolerance)
+            ),
             30,
-            f"the output to settle at {y}",
+            f"the loop to settle at {y}",
         )
 
     def latest_y(self, count: int) -> list[float]:
@@ -101,14 +105,12 @@ def test_manual_mode_by_topic_and_bumpless_return(live: Live) -> None:
 
 
 def test_inactive_publishes_nothing_and_comes_back_without_a_jump(live: Live) -> None:
-    from sensor_msgs.msg import JointState  # noqa: F401
-
     live.settle()
     assert live.graph.set_parameters(live.plant_name, fallback="hold")[0].successful
     assert live.graph.change_state(live.controller_name, "deactivate")
     live.graph.wait_until(lambda: live.graph.node.count_publishers("/live/control_effort") == 0, what="silence")
     live.graph.wait_until(lambda: live.graph.fact(live.plant_name, "state") == "fallback", what="the plant's fallback")
-    assert "inactive" in live.graph.fact(live.controller_name, "message")
+    live.graph.wait_until(lambda: "inactive" in live.graph.fact(live.controller_name, "message"))
     count, applied = len(live.efforts), live.outputs[-1].effort[0]
     for _ in range(2):  # and once more: activation and deactivation leave nothing behind
         assert live.graph.change_state(live.controller_name, "activate")

@@ -1,0 +1,188 @@
+"""A loop whose plant cannot be reset, as the tuner uses it: one candidate at a time, a step back and forth."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
+from tdof_npid_ros.graph.loop_client import tuned_parameters
+from tdof_npid_ros.graph.messages import signal_message, stamp_ns
+from tdof_npid_ros.graph.node import SIGNAL_QOS
+from tdof_npid_ros.graph.remote_node import RemoteNode
+from tdof_npid_ros.loop import Integrals
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
+from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.live import LoopLostError
+from tdof_npid_ros.tuning.objective import objective_values
+from tdof_npid_ros.tuning.problem import TuningProblem
+
+POLL = 0.02  # s between two looks at a trial
+
+
+class AlternateLoop:
+    """The controller of one namespace and whatever plant it drives, which must be running.
+
+    The last good gains are those on the controller before the tuning, then those of the best candidate so far.
+
+    Args:
+        node: through which everything goes; its executor spins in another thread.
+        problem: what is tuned.
+        test: how.
+        namespace: of the loop.
+        loop_timeout: s to wait for the loop at the start.
+        answer_timeout: s until a silent loop counts as lost.
+        check: called while waiting; raises to give up.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        problem: TuningProblem,
+        test: StepTest,
+        namespace: str,
+        loop_timeout: float,
+        answer_timeout: float,
+        check: Callable[[], None],
+    ) -> None:
+        base = namespace.rstrip("/")
+        self._node = node
+        self._problem = problem
+        self._test = test
+        self._namespace = namespace
+        self._loop_timeout = loop_timeout
+        self._answer_timeout = answer_timeout
+        self._check = check
+        self._controller = RemoteNode(node, f"{base}/controller", answer_timeout, check)
+        self._good: Gains | None = None
+        self._best = float("inf")
+        self._level = test.levels[0]
+        self._watching: Settling | Trial | None = None
+        self._outputs = 0
+        self._ended = threading.Event()
+        self._setpoint_publisher = node.create_publisher(JointState, f"{base}/setpoint", SIGNAL_QOS)
+        self._subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
+
+    @property
+    def in_use(self) -> list[str]:
+        """The namespace, once the loop has been seen to run."""
+        return [self._namespace] if self._good is not None else []
+
+    def evaluate(self, candidates: Array) -> Array:
+        """The IAE (n,) of a step of 1 of candidates (n, gains); failed ones get the penalty of a diverged lane.
+
+        Raises:
+            TuningError: the loop is not there, does not settle with the last good gains, or refused a gain.
+        """
+        if self._good is None:
+            self._begin()
+        return np.array([self._evaluate_one(candidate) for candidate in candidates])
+
+    def leave(self, gains: Gains | None) -> None:
+        """Set these gains, or the last good ones."""
+        if self._good is not None:
+            try:
+                self._controller.set_parameters(tuned_parameters(gains or self._good))
+            except (LoopLostError, TuningError) as error:
+                self._node.get_logger().error(f"the controller is left as it is: {error}")
+
+    # A candidate
+
+    def _begin(self) -> None:
+        end = time.monotonic() + self._loop_timeout
+        while not self._outputs:
+            self._check()
+            if time.monotonic() > end:
+                raise TuningError(f"no loop to tune: no output in {self._namespace} within {self._loop_timeout:g} s")
+            time.sleep(POLL)
+        self._good = gains_from_mapping(self._controller.parameters(GAIN_NAMES))
+
+    def _evaluate_one(self, candidate: Array) -> float:
+        self._settle_with_good_gains()
+        before, after = self._level, next(level for level in self._test.levels if level != self._level)
+        trial = Trial(self._test, before, after)
+        self._watch(trial)
+        self._apply(candidate)
+        self._wait()
+        self._level = trial.setpoint
+        if trial.outcome != "measured":
+            self._controller.set_parameters(tuned_parameters(self._good_gains))
+            self._node.get_logger().warning(f"candidate {candidate.tolist()} was {trial.outcome}: back to good gains")
+        result = Integrals(np.array([trial.iae]), np.array([trial.share]))
+        nothing = Integrals(np.zeros(1), np.ones(1))
+        value = float(objective_values(result, nothing, 0.0)[0])
+        if trial.outcome == "measured" and value < self._best:
+            self._best, self._good = value, self._problem.gains(candidate)
+        return value
+
+    def _settle_with_good_gains(self) -> None:
+        self._controller.set_parameters(tuned_parameters(self._good_gains))
+        settling = Settling(self._test, self._level)
+        self._watch(settling)
+        self._publish_setpoint(self._level)
+        self._wait()
+        if not settling.settled:
+            raise TuningError(
+                f"the output does not settle at {self._level:g} within {self._test.time_limit:g} s with the last good "
+                "gains: tune by hand until it does, or widen settle_band or time_limit"
+            )
+
+    def _apply(self, candidate: Array) -> None:
+        """Set a candidate's gains, which must be within the bounds whatever the optimiser says."""
+        for name, value, (low, high) in zip(self._problem.names, candidate, self._problem.bounds, strict=True):
+            if not low <= value <= high:
+                raise TuningError(f"{name} {value} is outside its bounds {[low, high]}: not applied")
+        self._controller.set_parameters(tuned_parameters(self._problem.gains(candidate)))
+
+    @property
+    def _good_gains(self) -> Gains:
+        assert self._good is not None
+        return self._good
+
+    # Watching
+
+    def _watch(self, watching: Settling | Trial) -> None:
+        self._ended.clear()
+        self._watching = watching
+
+    def _wait(self) -> None:
+        """Until what is watched has ended; raises LoopLostError if no outputs come any more."""
+        seen, moved = self._outputs, time.monotonic()
+        while not self._ended.wait(POLL):
+            self._check()
+            if self._outputs != seen:
+                seen, moved = self._outputs, time.monotonic()
+            elif time.monotonic() - moved > self._answer_timeout:
+                raise LoopLostError(f"no output in {self._namespace} for {self._answer_timeout:g} s")
+
+    def _on_output(self, message: JointState) -> None:
+        self._outputs += 1
+        now, output = stamp_ns(message.header.stamp) / 1e9, message.position[0]
+        watching = self._watching
+        if isinstance(watching, Trial):
+            before = watching.setpoint
+            watching.take(now, output, message.effort[0] if message.effort else None)
+            if watching.setpoint != before:
+                self._publish_setpoint(watching.setpoint)
+            if watching.outcome == "unsafe":
+                self._controller.request_parameters(tuned_parameters(self._good_gains))  # at once, from here
+            ended = watching.outcome != ""
+        elif watching is not None:
+            watching.take(now, output)
+            ended = watching.settled or watching.too_late
+        else:
+            return
+        if ended:
+            self._watching = None
+            self._ended.set()
+
+    def _publish_setpoint(self, setpoint: float) -> None:
+        message = signal_message("")
+        message.position = [setpoint]
+        self._setpoint_publisher.publish(message)
