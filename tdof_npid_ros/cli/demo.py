@@ -40,9 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
     if bag.exists():
         raise FileExistsError(f"{bag} exists already and is not overwritten: choose another --bag")
     with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as nodes:
-        nodes.start("recorder", {"bag": bag})
+        nodes.start("recorder", {"bag": bag, "lossless": True})
         for node in ("plant", "controller"):
-            nodes.start(node)
+            nodes.start(node, {"lossless": True})
         nodes.start("scenario", {"play": False})
         conductor = Conductor(NAMESPACE, nodes.check)
         try:

@@ -21,6 +21,7 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 
 OWN_LOOP, EVERY_LOOP = ".", "*"
 POLL = 0.05  # s between two looks for loops
+GATHERING = 2.5  # s at the start for all loops to be heard: two of their reports and a little
 
 
 @dataclass
@@ -72,6 +73,7 @@ class LoopPool:
         self._answer_timeout = answer_timeout
         self._check = check
         self._heard: dict[str, float] = {}  # when each node was heard last (monotonic, s)
+        self._gathered = 0.0  # when the tuning does not wait for further loops any more (monotonic, s)
         self._loops: dict[str, _Loop] = {}
         for loop in loops:
             if loop != EVERY_LOOP:
@@ -111,6 +113,7 @@ class LoopPool:
     def _usable(self) -> list[LoopClient]:
         """The loops to use now; waits for one."""
         end = time.monotonic() + self._loop_timeout
+        self._gathered = self._gathered or time.monotonic() + GATHERING
         while True:
             self._check()
             self._find()
@@ -118,11 +121,15 @@ class LoopPool:
                 if loop.why_out and self._is_heard(namespace):
                     self._join(namespace, loop)
             usable = [loop.client for loop in self._loops.values() if not loop.why_out]
-            if usable:
+            if usable and (time.monotonic() > self._gathered or self._knows_all()):
                 return usable
             if time.monotonic() > end or (self._loops and all(loop.refused for loop in self._loops.values())):
                 raise TuningError(f"no loop to tune: {self._why_none()}")
             time.sleep(POLL)
+
+    def _knows_all(self) -> bool:
+        """Whether no other loop is expected."""
+        return not self._finds_loops and all(loop.refused or not loop.why_out for loop in self._loops.values())
 
     def _find(self) -> None:
         if self._finds_loops:

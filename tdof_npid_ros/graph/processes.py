@@ -61,11 +61,13 @@ class NodeProcesses:
                 raise NodeProcessError(f"the node {node} ended with status {process.returncode}: {tail}")
 
     def stop(self) -> None:
-        """Interrupt every node, the last started first, and wait for it; kill what does not end."""
+        """Interrupt one node after the other, the last started first, and wait for it; kill what does not end.
+
+        So a recorder that was started first hears all that the others had to say.
+        """
         for process in reversed(self._processes.values()):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-        for process in self._processes.values():
             try:
                 process.wait(STOP_TIMEOUT)
             except subprocess.TimeoutExpired:

@@ -1,0 +1,239 @@
+"""The tuner over real nodes: E3 and E4, several loops, faults, and a plant that cannot be reset."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType
+from tdof_npid_ros.parameter_file import read_parameters
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.study import Study
+
+CASES = {"/p1": "p1-c0.5", "/p1_too": "p1-c0.5", "/p3": "p3-c1"}
+SHORT = {"setpoint": ("0 setpoint 1", "0.8 end"), "disturbance": ("0 disturbance 1", "0.7 end")}
+QUICK: dict[str, Any] = {"population": 5, "generations": 4, "polish": 5}
+Visited = list[tuple[list[list[float]], list[float]]]
+
+
+def short(case: str) -> Case:
+    return replace(load_case(case), episodes=SHORT)
+
+
+def problem(case: str = "p1-c0.5", kind: ControllerType = "tdof_npid2", seed: int = 0, **options: Any) -> TuningProblem:
+    return TuningProblem(short(case), kind, seed=seed, **{**QUICK, **options})
+
+
+def visited(study: Study, evaluate: Callable[[Array], Array], after: Callable[[Study], bool] | None = None) -> Visited:
+    """Every generation's candidates and values, as the study runs."""
+    seen: Visited = []
+
+    def noted(candidates: Array) -> Array:
+        values = evaluate(candidates)
+        seen.append((candidates.tolist(), values.tolist()))
+        return values
+
+    study.run(noted, after)
+    return seen
+
+
+def offline(which: TuningProblem) -> Visited:
+    return visited(Study(which), Objective(which))
+
+
+class LiveTuner:
+    """What the tuner node tunes with, in the test's process, so that a test need not start a node for each run."""
+
+    def __init__(self, domain: int) -> None:
+        import rclpy
+
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("tuner", context=self._context)
+        self._ended = threading.Event()
+        self._spinner = threading.Thread(target=self._spin, daemon=True)
+        self._spinner.start()
+
+    def _spin(self) -> None:
+        from rclpy.experimental import EventsExecutor
+
+        executor = EventsExecutor(context=self._context)
+        executor.add_node(self.node)
+        while not self._ended.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
+    def pool(
+        self, which: TuningProblem, loops: list[str], loop_timeout: float = 60.0, answer_timeout: float = 1.5
+    ) -> Any:
+        from tdof_npid_ros.graph.loop_pool import LoopPool
+
+        return LoopPool(self.node, which, loops, loop_timeout, answer_timeout, lambda: None)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._spinner.join()
+        self.node.destroy_node()
+        self._context.shutdown()
+
+
+@pytest.fixture(scope="module")
+def loops(shared_graph: Any) -> Any:
+    """Plants and controllers in three namespaces, two of them the same case. No scenario: the tuner needs none."""
+    for namespace, case in CASES.items():
+        for node in ("plant", "controller"):
+            shared_graph.start(
+                node, case=case, namespace=namespace, **({"reply_timeout": 0.2} if node == "plant" else {})
+            )
+    shared_graph.wait_for_nodes(*(f"{namespace}/{node}" for namespace in CASES for node in ("plant", "controller")))
+    return shared_graph
+
+
+@pytest.fixture
+def tuner(shared_graph: Any) -> Iterator[LiveTuner]:
+    live = LiveTuner(shared_graph.domain)
+    yield live
+    live.close()
+
+
+@pytest.fixture
+def tuner_file(tmp_path: Path) -> Callable[[str], Path]:
+    """Writes a case's parameter file with the short episodes."""
+
+    def write(case: str) -> Path:
+        lines = (Path(__file__).parents[2] / "config" / f"{case}.yaml").read_text().splitlines()
+        file = tmp_path / f"{case}.yaml"
+        changed = [
+            f"      {name}: {list(SHORT[name])}" if (name := line.strip().split(":")[0]) in SHORT else line
+            for line in lines
+        ]
+        file.write_text("\n".join(changed).replace("'", '"'))
+        return file
+
+    return write
+
+
+# E3 and E4
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("kind", CONTROLLER_TYPES)
+@pytest.mark.parametrize("namespace", ["/p1", "/p3"])
+def test_tuned_live_equals_tuned_offline(
+    loops: Any, tuner: LiveTuner, namespace: str, kind: ControllerType, seed: int
+) -> None:
+    which = problem(CASES[namespace], kind, seed)
+    assert visited(Study(which), tuner.pool(which, [namespace]).evaluate) == offline(which)
+
+
+def test_two_loops_give_what_one_gives(loops: Any, tuner: LiveTuner) -> None:
+    which = problem(seed=3)
+    pool = tuner.pool(which, ["/p1", "/p1_too"])
+    assert visited(Study(which), pool.evaluate) == offline(which)
+    assert pool.in_use == ["/p1", "/p1_too"]
+
+
+def test_loops_are_found_and_one_of_another_case_is_refused_before_it_costs_an_episode(
+    loops: Any, tuner: LiveTuner
+) -> None:
+    from sensor_msgs.msg import JointState
+
+    which = problem(seed=4)
+    outputs = loops.collect("/p3/output", JointState)
+    pool = tuner.pool(which, ["*"])
+    assert visited(Study(which), pool.evaluate) == offline(which)
+    assert pool.in_use == ["/p1", "/p1_too"]
+    loops.wait_for_nodes("/p3/plant")
+    assert not outputs
+
+
+def test_only_loops_of_another_case_end_the_tuning_with_the_reason(loops: Any, tuner: LiveTuner) -> None:
+    pool = tuner.pool(problem(), ["/p3"])
+    with pytest.raises(TuningError, match="/p3/plant has model third_order, but p1-c0.5 has first_order"):
+        pool.evaluate(np.ones((1, 5)))
+
+
+@pytest.mark.parametrize("node", ["controller", "plant"])
+def test_a_loop_killed_half_way_loses_its_share_and_is_used_again_when_it_is_back(
+    loops: Any, tuner: LiveTuner, node: str
+) -> None:
+    which = problem(seed=5, generations=8)
+    pool = tuner.pool(which, ["/p1", "/p1_too"])
+    process = next(p for p in reversed(loops.processes) if p.node == node and "__ns:=/p1_too" in p.process.args)
+    used: list[list[str]] = []
+
+    def after(study: Study) -> bool:
+        used.append(pool.in_use)
+        if study.generation == 2:
+            process.send(signal.SIGKILL)
+        if study.generation == 4:
+            loops.start(node, case="p1-c0.5", namespace="/p1_too")
+            loops.wait_for_nodes(f"/p1_too/{node}")
+            time.sleep(0.3)  # the pool's node may hear of it later than this one
+        return True
+
+    assert visited(Study(which), pool.evaluate, after) == offline(which)
+    assert used[1] == ["/p1", "/p1_too"]
+    assert used[3] == ["/p1"]
+    assert used[-1] == ["/p1", "/p1_too"]
+
+
+def test_a_run_killed_and_started_again_ends_as_one_left_alone(
+    loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path
+) -> None:
+    from sensor_msgs.msg import JointState
+
+    parameters = {
+        "type": "npid", "seed": 6, **QUICK, "generations": 12,
+        "checkpoint": str(tmp_path / "checkpoint.json"), "result": str(tmp_path / "tuned.yaml"), "loops": ["/p1"],
+    }  # fmt: skip
+    case = tuner_file("p1-c0.5")
+    progress = loops.collect("tuning_progress", JointState)
+    killed = loops.start("tuner", "-p", f"case:={case}", **parameters)
+    loops.wait_until(lambda: progress and progress[-1].position[1] >= 4, 60, "the fourth generation")
+    killed.send(signal.SIGKILL)
+    again = loops.start("tuner", "-p", f"case:={case}", **parameters)
+    again.stopped = True  # it ends by itself
+    loops.wait_until(lambda: again.process.poll() is not None, 60, "the end of the second run")
+    which = problem(kind="npid", seed=6, generations=12)
+    study = Study(which)
+    study.run(Objective(which))
+    assert read_parameters(tmp_path / "tuned.yaml", "controller") == study.result.gains.as_dict()
+    assert "confirmed" in again.log
+    assert progress[-1].position[0] == study.best_value
+    assert list(progress[-1].name) == ["best", "generation", "evaluations", "budget", "kp", "ki", "kd"]
+    gains = study.result.gains
+    assert loops.get_parameters("/p1/controller", "type", "kp", "ki") == ["npid", gains.kp, gains.ki]
+    assert loops.get_parameters("/p1/plant", "lanes") == [1]
+
+
+def test_ctrl_c_ends_with_the_generation_and_leaves_the_best_so_far(
+    loops: Any, tuner_file: Callable[[str], Path]
+) -> None:
+    from sensor_msgs.msg import JointState
+
+    progress = loops.collect("/p3/tuning_progress", JointState)
+    case = str(tuner_file("p3-c1"))
+    process = loops.start("tuner", "-p", f"case:={case}", namespace="/p3", type="pid", **{**QUICK, "generations": 500})
+    loops.wait_until(lambda: len(progress) >= 2, 60, "two generations")
+    assert process.stop() < 5.0
+    assert "interrupted after" in process.log
+    latest = dict(zip(progress[-1].name, progress[-1].position, strict=True))
+    assert loops.get_parameters("/p3/controller", "type", "kp", "ki", "kd") == [
+        "pid",
+        *(latest[n] for n in ("kp", "ki", "kd")),
+    ]
+    assert loops.get_parameters("/p3/plant", "lanes") == [1]
