@@ -81,8 +81,8 @@ def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None) -> floa
     )
     recorded = recording is not None
     with NodeProcesses(file, NAMESPACE) as nodes:
-        if recorded:
-            nodes.start("recorder", {"bag": folder / "bag"})
+        if recording is not None:
+            nodes.start("recorder", {"bag": folder / "bag", **recording})
         for node in ("plant", "controller", "scenario"):
             nodes.start(node, recording)
         conductor = Conductor(NAMESPACE, nodes.check)

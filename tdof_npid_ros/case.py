@@ -12,6 +12,7 @@ from typing import Any
 
 from tdof_npid_ros import loop
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType, Gains, gains_from_mapping
+from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
@@ -31,7 +32,7 @@ class Case:
         sample_period_ns: of the loop.
         model: the plant's model, and `plant_values` its parameters.
         effort_limits: the plant's own limits on the effort.
-        gains: the controller's.
+        gains: the controller's, and `operation` what is set around its law.
         episodes: the scenario's lines by episode, in the order in which they run.
         bounds: of the tuner's search, by gain.
         weight: w of the objective (10).
@@ -46,6 +47,7 @@ class Case:
     episodes: Mapping[str, tuple[str, ...]]
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     weight: float = 1.0
+    operation: Operation = PLAIN
 
     @property
     def sample_period(self) -> float:
@@ -84,10 +86,18 @@ class Case:
 
     def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
         """Run an episode in process; gains for one lane or many, by default the case's."""
-        return loop.simulate(self.plant_at, gains or self.gains, self.signals[episode], self.effort_limits)
+        gains, signals = gains or self.gains, self.signals[episode]
+        if self.operation.is_plain:
+            return loop.simulate(self.plant_at, gains, signals, self.effort_limits)
+        return loop.simulate_operated(self.plant_at, gains, self.operation, signals, self.effort_limits)
 
     def integrals(self, episode: str, gains: Gains) -> loop.Integrals:
         """Run an episode in process and keep only its integrals."""
+        if not self.operation.is_plain:
+            raise PlantError(
+                f"{self.name}: tuning runs the law alone; take these out of the controller's parameters first: "
+                + ", ".join(name for name, value in self.operation.as_dict().items() if value != PLAIN.as_dict()[name])
+            )
         return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
 
     def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:
@@ -145,6 +155,7 @@ def load_case(name: str | Path) -> Case:
             episodes=read_episodes(scenario),
             bounds=_bounds(tuner),
             weight=float(tuner.get("weight", 1.0)),
+            operation=operation_from_mapping(controller),
         )
         _ = case.plant, case.plans
     except (ValueError, TypeError) as error:

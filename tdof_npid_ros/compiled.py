@@ -35,11 +35,13 @@ def compiled(function: F) -> F:
     return cast(F, numba.njit(error_model="numpy", nogil=True, forceinline=True)(function))
 
 
-@intrinsic
-def fused_multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+def _fused_multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, rounded once. Written out where it is wanted, so that every processor gives the same bits."""
     signature = types.float64(types.float64, types.float64, types.float64)
     return signature, lambda context, builder, sig, arguments: builder.fma(*arguments)
+
+
+fused_multiply_add: Callable[[float, float, float], float] = intrinsic(_fused_multiply_add)
 
 
 def implementation_of(stub: Callable[..., Any]) -> Callable[[F], F]:

@@ -16,11 +16,14 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
+from tdof_npid_ros.control.operation import Operation
 from tdof_npid_ros.plants.kernels import plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.states import loaded, store
 from tdof_npid_ros.scenario import Signals
 
@@ -76,6 +79,25 @@ def simulate(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: t
     """
     output, effort = np.empty((2, signals.steps + 1, gains.lanes))
     _run(plant_at, gains, signals, effort_limits, output, effort)
+    return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
+
+
+def simulate_operated(
+    plant_at: PlantAt, gains: Gains, operation: Operation, signals: Signals, effort_limits: tuple[float, float]
+) -> Trajectory:
+    """As `simulate`, with an operation around the law: stepped one by one, by the same classes as in the nodes."""
+    period_ns, lanes = signals.sample_period_ns, gains.lanes
+    controller = Controller(gains, period_ns, operation)
+    simulator = PlantSimulator(plant_at({}), period_ns, lanes, effort_limits)
+    plants = {segment.first: plant_at(segment.plant) for segment in signals.segments}
+    output, effort = np.empty((2, signals.steps + 1, lanes))
+    for k in range(signals.steps + 1):
+        output[k] = simulator.output
+        controller.answer(k * period_ns, np.full(lanes, signals.setpoint[k]), simulator.output)
+        effort[k] = controller.effort
+        if k in plants:
+            simulator.change_plant(plants[k])
+        simulator.advance(controller.effort, np.full(lanes, signals.disturbance[k]))
     return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
 
 

@@ -7,7 +7,7 @@ as in the controller node.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -224,23 +224,22 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
     answers = loop.control_effort
     assert answers is not None
     outputs = loop.output
-    frames = outputs.frame_id.tolist()
-    stamps = outputs.stamp_ns.tolist()
-    position = 0
-    before = 0
+    places: dict[tuple[str, int], list[int]] = defaultdict(list)  # of the outputs, latest first
+    for i in range(len(outputs) - 1, -1, -1):
+        places[str(outputs.frame_id[i]), int(outputs.stamp_ns[i])].append(i)
+    latest = before = 0
     for step, (frame, stamp, sequence) in enumerate(
         zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)
     ):
         digest, _, episode = frame.partition(" ")
-        at = position
-        while at < len(stamps) and not (stamps[at] == stamp and frames[at] == episode):
-            at += 1
-        found = at < len(stamps)
-        if found:
-            position = at + 1
-        yield _Answer(
-            step, stamp, digest, episode, at if found else -1, sequence == 1, not sequence or sequence == before + 1
-        )
+        candidates = places.get((episode, stamp), [])
+        while candidates and candidates[-1] < latest:
+            candidates.pop()
+        if candidates:
+            latest = candidates[-1]
+        new_publisher = sequence == 1 and (step == 0 or before > 0)
+        follows = not sequence or sequence == before + 1
+        yield _Answer(step, stamp, digest, episode, latest if candidates else -1, new_publisher, follows)
         before = sequence
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -29,7 +30,10 @@ POLL = 0.02  # s between two looks at a trial
 class AlternateLoop:
     """The controller of one namespace and whatever plant it drives, which must be running.
 
-    The last good gains are those on the controller before the tuning, then those of the best candidate so far.
+    The last good gains are those on the controller before the tuning, then those of the best candidate so far. When a
+    candidate fails, the loop goes back to them, to the level where it was settled, and to the integral action that it
+    had there: without that, a nonlinear controller may stay where the failed one has wound it up to, for its integral
+    action hardly moves at large errors.
 
     Args:
         node: through which everything goes; its executor spins in another thread.
@@ -63,11 +67,16 @@ class AlternateLoop:
         self._good: Gains | None = None
         self._best = float("inf")
         self._level = test.levels[0]
+        self._integral: float | None = None  # the latest on controller_state
+        self._integral_at_rest: float | None = None
         self._watching: Settling | Trial | None = None
         self._outputs = 0
         self._ended = threading.Event()
         self._setpoint_publisher = node.create_publisher(JointState, f"{base}/setpoint", SIGNAL_QOS)
-        self._subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
+        self._state_subscription = node.create_subscription(
+            JointState, f"{base}/controller_state", self._on_controller_state, SIGNAL_QOS
+        )
+        self._output_subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
 
     @property
     def in_use(self) -> list[str]:
@@ -88,7 +97,7 @@ class AlternateLoop:
         """Set these gains, or the last good ones."""
         if self._good is not None:
             try:
-                self._controller.set_parameters(tuned_parameters(gains or self._good))
+                self._controller.set_parameters(self._settings(gains or self._good))
             except (LoopLostError, TuningError) as error:
                 self._node.get_logger().error(f"the controller is left as it is: {error}")
 
@@ -102,18 +111,19 @@ class AlternateLoop:
                 raise TuningError(f"no loop to tune: no output in {self._namespace} within {self._loop_timeout:g} s")
             time.sleep(POLL)
         self._good = gains_from_mapping(self._controller.parameters(GAIN_NAMES))
+        self._limits = self._good.integral_min, self._good.integral_max
 
     def _evaluate_one(self, candidate: Array) -> float:
         self._settle_with_good_gains()
-        before, after = self._level, next(level for level in self._test.levels if level != self._level)
-        trial = Trial(self._test, before, after)
+        trial = Trial(self._test, self._level, next(level for level in self._test.levels if level != self._level))
         self._watch(trial)
         self._apply(candidate)
         self._wait()
-        self._level = trial.setpoint
-        if trial.outcome != "measured":
-            self._controller.set_parameters(tuned_parameters(self._good_gains))
+        if trial.outcome == "measured":
+            self._level = trial.setpoint
+        else:
             self._node.get_logger().warning(f"candidate {candidate.tolist()} was {trial.outcome}: back to good gains")
+            self._recover()
         result = Integrals(np.array([trial.iae]), np.array([trial.share]))
         nothing = Integrals(np.zeros(1), np.ones(1))
         value = float(objective_values(result, nothing, 0.0)[0])
@@ -122,23 +132,44 @@ class AlternateLoop:
         return value
 
     def _settle_with_good_gains(self) -> None:
-        self._controller.set_parameters(tuned_parameters(self._good_gains))
-        settling = Settling(self._test, self._level)
-        self._watch(settling)
-        self._publish_setpoint(self._level)
-        self._wait()
-        if not settling.settled:
+        self._controller.set_parameters(self._settings(self._good_gains))
+        if not self._settles():
             raise TuningError(
                 f"the output does not settle at {self._level:g} within {self._test.time_limit:g} s with the last good "
                 "gains: tune by hand until it does, or widen settle_band or time_limit"
             )
+        self._integral_at_rest = self._integral
+
+    def _recover(self) -> None:
+        """Go back to rest with the last good gains, the integral action held at what it was there."""
+        self._controller.set_parameters(self._at_rest())
+        self._settles()
+
+    def _settles(self) -> bool:
+        """Whether the output settles at the level within the time limit."""
+        settling = Settling(self._test, self._level)
+        self._watch(settling)
+        self._publish_setpoint(self._level)
+        self._wait()
+        return settling.settled
 
     def _apply(self, candidate: Array) -> None:
         """Set a candidate's gains, which must be within the bounds whatever the optimiser says."""
         for name, value, (low, high) in zip(self._problem.names, candidate, self._problem.bounds, strict=True):
             if not low <= value <= high:
                 raise TuningError(f"{name} {value} is outside its bounds {[low, high]}: not applied")
-        self._controller.set_parameters(tuned_parameters(self._problem.gains(candidate)))
+        self._controller.set_parameters(self._settings(self._problem.gains(candidate)))
+
+    def _settings(self, gains: Gains) -> dict[str, Any]:
+        """The controller's parameters for gains, with the integral action's limits of before the tuning."""
+        return {**tuned_parameters(gains), "integral_min": self._limits[0], "integral_max": self._limits[1]}
+
+    def _at_rest(self) -> dict[str, Any]:
+        """The controller's parameters for the last good gains, with the integral action held as it was at rest."""
+        settings = self._settings(self._good_gains)
+        if self._integral_at_rest is not None:
+            settings |= {"integral_min": self._integral_at_rest, "integral_max": self._integral_at_rest}
+        return settings
 
     @property
     def _good_gains(self) -> Gains:
@@ -171,7 +202,8 @@ class AlternateLoop:
             if watching.setpoint != before:
                 self._publish_setpoint(watching.setpoint)
             if watching.outcome == "unsafe":
-                self._controller.request_parameters(tuned_parameters(self._good_gains))  # at once, from here
+                self._controller.request_parameters(self._at_rest())  # at once, from here
+                self._publish_setpoint(watching.before)
             ended = watching.outcome != ""
         elif watching is not None:
             watching.take(now, output)
@@ -181,6 +213,10 @@ class AlternateLoop:
         if ended:
             self._watching = None
             self._ended.set()
+
+    def _on_controller_state(self, message: JointState) -> None:
+        if "integral" in message.name:
+            self._integral = message.position[message.name.index("integral")]
 
     def _publish_setpoint(self, setpoint: float) -> None:
         message = signal_message("")

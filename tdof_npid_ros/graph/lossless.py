@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.graph.messages import stamp_ns
 from tdof_npid_ros.graph.node import SIGNAL_QOS, LoopNode
 
 TOPIC = "recorded"
-WINDOW = 300  # steps; publishers keep 1000 messages
+WINDOW = 600  # steps; publishers keep 1000 messages
 NO_LOG = "stopped"  # what `recorded` bears when the recorder has given up: the loop goes on without
 
 
@@ -26,20 +25,19 @@ class Log:
         grown: called when the log has grown.
     """
 
-    def __init__(self, node: LoopNode, output: Publisher, period_ns: int, grown: Callable[[], None]) -> None:
-        self._output = output
+    def __init__(self, node: LoopNode, period_ns: int, grown: Callable[[], None]) -> None:
         self._window_ns = WINDOW * period_ns
         self._grown = grown
         self._episode, self._stamp_ns = "", 0
         node.create_subscription(JointState, TOPIC, self._on_recorded, SIGNAL_QOS)
 
-    def is_near(self, episode: str, time_ns: int) -> bool:
-        """Whether the output of `time_ns` may be published."""
-        if self._episode == NO_LOG:
-            return True
-        if time_ns < self._window_ns:
-            return bool(self._output.get_subscription_count() > 1)  # the controller and the recorder
-        return self._episode == episode and time_ns - self._stamp_ns < self._window_ns
+    def has_begun(self, episode: str) -> bool:
+        """Whether the episode's first output and answer are in the log."""
+        return self._episode in (episode, NO_LOG)
+
+    def is_near(self, time_ns: int) -> bool:
+        """Whether the output of `time_ns` of an episode that has begun may be published."""
+        return self._episode == NO_LOG or time_ns - self._stamp_ns < self._window_ns
 
     def _on_recorded(self, message: JointState) -> None:
         self._episode, self._stamp_ns = message.header.frame_id, stamp_ns(message.header.stamp)

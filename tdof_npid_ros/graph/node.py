@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import socket
 import sys
 import threading
 from collections import Counter
@@ -208,7 +209,6 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
 
 def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = None) -> None:
     """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # before any thread is made: `Stop` alone takes them
     stop = Stop()
     node = None
     try:
@@ -224,6 +224,7 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
                 node.deactivate()
             node.destroy_node()
         rclpy.try_shutdown()
+        stop.ignore_further()
     sys.exit(status)
 
 
@@ -246,18 +247,32 @@ def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> 
 
 
 class Stop:
-    """Waits for a signal to stop, beside the node, so that the node ends between two callbacks and in order."""
+    """Takes the signals to stop, so that the node ends between two callbacks and in order.
+
+    The executor waits in C++, where no Python handler runs. So a signal is passed through a socket to a thread that
+    wakes the executor. Signals that follow are ignored: the node is ending.
+    """
 
     def __init__(self) -> None:
         self.requested = False
         self._wake: Callable[[], None] | None = None
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno())
+        for number_ in STOP_SIGNALS:
+            signal.signal(number_, lambda *_: None)
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
-        signal.sigwait(STOP_SIGNALS)
+        self._reader.recv(1)
         self.requested = True
         if self._wake is not None:
             self._wake()
+
+    def ignore_further(self) -> None:
+        """For the end of the process, also while the interpreter shuts down."""
+        for number_ in STOP_SIGNALS:
+            signal.signal(number_, signal.SIG_IGN)
 
     def wakes(self, executor: Any) -> None:
         """Wake this executor when the signal comes."""

@@ -38,7 +38,7 @@ class LockstepPlant:
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         node.subscribe(JointState, "control_effort", self._on_answer, RECENT_QOS, sole=True)
         self.held = False  # an output waits for the log
-        self.log = Log(node, node.output_publisher, node.period_ns, self._on_log_grown) if node.lossless else None
+        self.log = Log(node, node.period_ns, self._on_log_grown) if node.lossless else None
         timeout = float(node.values_of(["reply_timeout"])["reply_timeout"])
         node.create_timer(timeout, self._on_reply_timeout, clock=STEADY)
         if node.get_parameter("publish_clock").value:
@@ -69,7 +69,8 @@ class LockstepPlant:
         node.output.header.frame_id = self.episode.name
         self.running, self.stopped, self.repeats = True, False, 0
         node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {self.episode.steps} steps")
-        self._publish_when_logged(self.episode)
+        self.held = False
+        node.publish_output(0)
         node.publish_diagnostics()
 
     def _on_answer(self, message: JointState) -> None:
@@ -83,6 +84,8 @@ class LockstepPlant:
             return
         if not node.is_sound(message.effort, "control_effort"):
             return
+        if self.log is not None and not self.log.has_begun(episode.name):
+            return  # not even the first answer must be missing: it comes again
         if self.stopped:
             node.get_logger().info("the controller answers again: going on")
             self.running, self.stopped = True, False
@@ -96,22 +99,26 @@ class LockstepPlant:
             node.publish_diagnostics()
 
     def _publish_when_logged(self, episode: Episode) -> None:
-        self.held = self.log is not None and not self.log.is_near(episode.name, episode.stamp_ns)
+        self.held = self.log is not None and not self.log.is_near(episode.stamp_ns)
         if not self.held:
             self._node.publish_output(episode.stamp_ns)
 
     def _on_log_grown(self) -> None:
-        if self.held and self.running and self.episode is not None:
+        if not self.running or self.episode is None:
+            return
+        if self.episode.stamp_ns == 0:
+            self._repeat_output(self.episode)
+        elif self.held:
             self._publish_when_logged(self.episode)
 
     def _on_reply_timeout(self) -> None:
         node, episode = self._node, self.episode
         if not self.running or episode is None:
             return
-        if self.held:
-            self._on_log_grown()
-            if self.held:
-                node.refuse("held_up", "lossless: waiting for the recorder")
+        if self.log is not None and (self.held or not self.log.has_begun(episode.name)):
+            node.refuse("held_up", "lossless: waiting for the recorder; start one with lossless in this namespace")
+            if not self.held:
+                node.publish_output(episode.stamp_ns)
             return
         waiting = (self.episodes, episode.stamp_ns)
         if waiting != self.waiting:

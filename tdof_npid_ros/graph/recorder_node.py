@@ -32,7 +32,8 @@ from tdof_npid_ros.graph.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
-CALM_LOOKS = 20  # looks without a change, after which there is one a second
+CALM_DISCOVERY_PERIOD = 0.5  # s, when it does not
+CALM_LOOKS = 20  # looks without a change
 PARAMETER_EVENTS = "/parameter_events"
 EVERYTHING = ["*", PARAMETER_EVENTS, "/rosout", "/diagnostics", "/clock"]
 # The loop's own topics are subscribed before their publishers come, so that not even the first message is missed.
@@ -72,7 +73,7 @@ class RecorderNode(LoopNode):
         )
         self.exclude = self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True)
         self.lossless = self.declare_value(
-            "lossless", False, "tell the plant on `recorded` how far the log is; set it on plant and controller, too", fixed=True
+            "lossless", False, "tell the plant on `recorded` how far the log is; the plant needs it, too", fixed=True
         )
         self.accept_changes()
         self.failure = ""
@@ -80,10 +81,12 @@ class RecorderNode(LoopNode):
         self.writer = self._open() if self.autostart else None
 
     def activate(self) -> None:
+        """Open the bag and subscribe."""
         self.writer = self.writer or self._open()
         self.lock = threading.Lock()  # of taps, which the thread looks at
         self.snapshots = ParameterSnapshots(self, self._write_snapshot)
-        self.looks = self.calm_looks = 0
+        self.graph: object = None
+        self.calm_looks = 0
         for name, kind in EXPECTED.items():
             topic = self.resolve_topic_name(name)
             if self._wanted(topic):
@@ -97,6 +100,7 @@ class RecorderNode(LoopNode):
         self._look()
 
     def deactivate(self) -> None:
+        """Close the bag with its account."""
         if self.writer is not None:
             self.discovery.cancel()
             self.thread.stop()
@@ -116,17 +120,21 @@ class RecorderNode(LoopNode):
         if self.failure:
             self._let_go()
             return
-        self.looks += 1
-        if self.calm_looks < CALM_LOOKS or self.looks % round(1 / DISCOVERY_PERIOD) == 0:
-            self._look()
+        self._look()
+        calm = self.calm_looks >= CALM_LOOKS
+        self.discovery.timer_period_ns = round((CALM_DISCOVERY_PERIOD if calm else DISCOVERY_PERIOD) * 1e9)
 
     def _look(self) -> None:
-        before = len(self.taps)
-        for topic, types in self.get_topic_names_and_types():
+        topics = self.get_topic_names_and_types()
+        graph = topics, [self.count_publishers(topic) for topic, _ in topics]
+        self.calm_looks = self.calm_looks + 1 if graph == self.graph else 0
+        self.snapshots.look()
+        if self.calm_looks > CALM_LOOKS:
+            return
+        self.graph = graph
+        for topic, types in topics:
             if self._wanted(topic) and len(types) == 1:
                 self._follow(topic, types[0])
-        self.snapshots.look()
-        self.calm_looks = self.calm_looks + 1 if len(self.taps) == before else 0
 
     def _wanted(self, topic: str) -> bool:
         namespace = self.get_namespace().rstrip("/") + "/"
@@ -231,8 +239,11 @@ class RecorderNode(LoopNode):
     # State
 
     def _account(self) -> dict[str, str]:
-        lost = {f"lost {tap.topic}": str(tap.lost) for tap in self.taps.values() if tap.lost}
-        return {"namespace": self.get_namespace(), "recorded": str(self.counts["recorded"]), "lost": str(self.lost), **lost}
+        taps = self.taps.values()
+        lost = {f"lost {tap.topic}": str(tap.lost) for tap in taps if tap.lost}
+        missed = {f"published before the recorder came {tap.topic}": str(tap.missed) for tap in taps if tap.missed}
+        account = {"namespace": self.get_namespace(), "recorded": str(self.counts["recorded"]), "lost": str(self.lost)}
+        return {**account, **lost, **missed}
 
     @property
     def lost(self) -> int:
@@ -240,6 +251,7 @@ class RecorderNode(LoopNode):
         return sum(tap.lost for tap in self.taps.values())
 
     def state(self) -> tuple[int, str, dict[str, object]]:
+        """What is recorded where, and what went wrong."""
         facts: dict[str, object] = {"bag": self.folder, "topics": len(self.taps), "lost": self.lost}
         if self.failure:
             return ERROR, self.failure, facts

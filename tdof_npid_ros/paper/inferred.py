@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def optimality(row: Published, reading: Callable[[Published], Variant]) -> Optim
         return objective(reading(row._replace(**gains)))
 
     simplex = np.vstack([np.zeros(len(names)), FIRST_STEP * np.eye(len(names))])
-    options = {"maxfev": EVALUATIONS, "xatol": 1e-3, "fatol": 1e-6, "initial_simplex": simplex}
+    options: Any = {"maxfev": EVALUATIONS, "xatol": 1e-3, "fatol": 1e-6, "initial_simplex": simplex}
     best = minimize(at, simplex[0], method="Nelder-Mead", options=options)
     return Optimality(
         100.0 * (objective(reading(row)) / float(best.fun) - 1.0),

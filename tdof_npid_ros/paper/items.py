@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.paper import figures
 from tdof_npid_ros.paper.evaluation import (
@@ -122,8 +123,9 @@ def variation_table(name: str) -> Item:
             "variation", "controller", "quantity", "published", "ours at the published gains", "Δ published gains (%)",
             "the same, at rest before the change", "Δ at rest (%)", "ours, tuned", "Δ tuned (%)",
         )  # fmt: skip
+        limit = paper_case("sprott").gains.effort_max
         note = (
-            "From 5 s on, as the paper says, the setpoint response is not over yet in our loop (the effort limit of ±30 "
+            f"From 5 s on, as the paper says, the setpoint response is not over yet in our loop (the effort limit of ±{limit:g} "
             "makes the integral wind up), and its rest outweighs the effect of a. 'At rest': a changes at 120 s instead. "
             "The recovery times are with the evidence on Table 9."
         )
@@ -271,16 +273,20 @@ def chaos_figure(name: str) -> Item:
     return Item((), build)
 
 
-def variation_metrics(gains: Gains, a: float, change_at: float) -> tuple[float, float, float]:
-    """M_peak, IAE (s) and the time (s, from the change) to within 5 % of M_peak, from the change on."""
-    deviation = np.abs(variation_response(gains, a, change_at))
-    period = paper_case("sprott").sample_period
+def variation_metrics(gains: Gains, a: float, change_at: float, case: Case | None = None) -> tuple[float, float, float]:
+    """M_peak, IAE (s) and the time (s, from the change) to within 5 % of M_peak, from the change on.
+
+    Args:
+        case: the circuit's, unless another variant of it is meant.
+    """
+    case = case or paper_case("sprott")
+    deviation = np.abs(variation_response(gains, a, change_at, case))
+    period = case.sample_period
     return float(deviation.max()), float(np.trapezoid(deviation, dx=period)), time_to_share_of_peak(deviation, period)
 
 
-def variation_response(gains: Gains, a: float, change_at: float) -> np.ndarray:
+def variation_response(gains: Gains, a: float, change_at: float, case: Case) -> np.ndarray:
     """y - 1 from the change of `a` on, (steps,), for as long as in the case's own episode."""
-    case = paper_case("sprott")
     own = case.signals[VARIATION_EPISODES[a]]
     length = float(own.time[-1]) - CHANGE_AT
     nominal = f"0 plant.a {case.plant_values['a']:g}"
@@ -295,8 +301,9 @@ def time_to_share_of_peak(deviation: np.ndarray, period: float, share: float = 0
 
 
 def _from_rest(row: Row, a: float) -> Curve:
-    deviation = variation_response(row.at_published.gains, a, SETTLED_AT)
-    return Curve(row.published.controller, np.arange(len(deviation)) * paper_case("sprott").sample_period, deviation)
+    case = paper_case("sprott")
+    deviation = variation_response(row.at_published.gains, a, SETTLED_AT, case)
+    return Curve(row.published.controller, np.arange(len(deviation)) * case.sample_period, deviation)
 
 
 def _rows(evaluated: Evaluated, cases: Sequence[str]) -> list[Row]:

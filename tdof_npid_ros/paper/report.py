@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 Cell = str | float | int | None
 DEVIATION = "Δ"  # the headings of columns of deviations begin with it
 NOTHING = "–"
+LEAST_SHOWN = 5e-5  # smaller numbers are shown as 0
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,20 @@ def shown_cell(cell: Cell, heading: str) -> str:
     if cell is None:
         return NOTHING
     if isinstance(cell, float):
-        return f"{cell:+.1f}" if heading.startswith(DEVIATION) else f"{cell:.4g}"
+        return _shown_deviation(cell) if heading.startswith(DEVIATION) else _shown_number(cell)
     return str(cell)
+
+
+def _shown_number(value: float) -> str:
+    """Four digits, without zeros beyond the third decimal."""
+    if abs(value) < LEAST_SHOWN:
+        return "0"
+    return re.sub(r"(\.\d{3}\d*?)0+$", r"\1", f"{value:#.4g}".rstrip("."))
+
+
+def _shown_deviation(value: float) -> str:
+    """With its sign; one decimal, or two where one would show nothing."""
+    return f"{value:+.1f}" if abs(value) >= 0.1 else f"{round(value, 2) + 0.0:+.2f}"
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ class Trial:
     """One candidate: it settles at the level where the plant is, then steps to the other and settles there.
 
     Attributes:
+        before: the level where it begins.
         setpoint: what the setpoint is to be now.
         outcome: empty while it runs; `unsettled` and `unsafe` are failures.
         iae: of the step, by the trapezoidal rule, for a step of 1.
@@ -99,6 +100,7 @@ class Trial:
     def __init__(self, test: StepTest, before: float, after: float) -> None:
         self._test = test
         self._after = after
+        self.before = before
         self._settling = Settling(test, before)
         self._latest: tuple[float, float] | None = None
         self.setpoint = before

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.case import load_case
+from tdof_npid_ros.control.operation import Operation
 
+AT_ONCE = 2.5  # s; some 0.3 s on a quiet machine
 PERIOD_NS = 5_000_000
 SHORT = {
     "p1-c0.5": ("0 setpoint 1", "0.5 disturbance 0.5", "1.5 end"),
@@ -62,6 +64,14 @@ def test_distributed_equals_local_with_lanes(graph: Any) -> None:
     assert np.array_equal(u, local.control_effort)
 
 
+def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> None:
+    operation = {"setpoint_rate": 2.0, "effort_rate": 50.0, "dead_band": 0.01, "filter_time": 0.02, "setpoint_max": 0.9}
+    y, u = run_short(graph, "p1-c0.5", **operation)
+    local = dataclasses.replace(load_short("p1-c0.5"), operation=Operation(**operation)).simulate("short")
+    assert np.array_equal(y, local.output)
+    assert np.array_equal(u, local.control_effort)
+
+
 def test_nodes_start_in_any_order_in_a_namespace_and_end_at_once(graph: Any) -> None:
     scenario = graph.start("scenario", namespace="/a", mode="lockstep", episodes=["e"],
                            plan__e=["0 setpoint 1", "1 end"])  # fmt: skip
@@ -70,7 +80,7 @@ def test_nodes_start_in_any_order_in_a_namespace_and_end_at_once(graph: Any) -> 
     plant = graph.start("plant", namespace="/a", mode="lockstep")
     graph.wait_until(lambda: graph.fact("/a/plant", "state") == "finished", 60, "the end of the episode")
     for process in (plant, controller, scenario):
-        assert process.stop() < 1.0
+        assert process.stop() < AT_ONCE
 
 
 def test_controller_killed_and_restarted(graph: Any) -> None:
@@ -191,7 +201,6 @@ class TestController:
         plan = loop.publisher(
             "/c/scenario_plan", JointTrajectory, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         )
-        rejected = int(loop.fact("/c/controller", "rejected", 0))
         point = JointTrajectoryPoint(positions=[math.nan])
         for message in (
             JointTrajectory(),
@@ -199,8 +208,9 @@ class TestController:
             JointTrajectory(joint_names=["setpoint"], points=[point, JointTrajectoryPoint(
                 positions=[1.0], time_from_start=Duration(sec=1))]),
         ):  # fmt: skip
+            rejected = int(loop.fact("/c/controller", "rejected", 0))
             plan.publish(message)
-        loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 3, what="3 rejections")
+            loop.wait_until(lambda n=rejected: int(loop.fact("/c/controller", "rejected", 0)) > n, what="a rejection")
 
     def test_idle_uses_no_measurable_processor_time(self, loop: Any) -> None:
         stat = Path(f"/proc/{loop.process.process.pid}/stat")

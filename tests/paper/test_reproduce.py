@@ -14,11 +14,13 @@ from tdof_npid_ros.control.law import KD_H, PHI, coefficients
 from tdof_npid_ros.paper import findings
 from tdof_npid_ros.paper.conclusions import TOLERANCES
 from tdof_npid_ros.paper.evaluation import deviation_percent, evaluate_row, measure, paper_case, published_gains
+from tdof_npid_ros.paper.inferred import OPTIMAL, as_stated, inferred, optimality
 from tdof_npid_ros.paper.items import ITEMS, SETTLED_AT, variation_metrics
 from tdof_npid_ros.paper.output import MARKER, OutputError, claim_folder
-from tdof_npid_ros.paper.report import Figure, Table
+from tdof_npid_ros.paper.pages import Section, html_page
+from tdof_npid_ros.paper.report import Figure, Table, shown_cell
 from tdof_npid_ros.paper.reproduce import Effort, Reproduction, reproduce
-from tdof_npid_ros.paper.tables import ROWS, VARIATIONS, Published, PublishedVariation
+from tdof_npid_ros.paper.tables import CASES, ROWS, VARIATIONS, Published, PublishedVariation
 
 QUICK = Effort(seeds=1, generations=3, pareto_generations=3)
 REPRODUCED_CASES = ("p1-c4", "p2-c2", "p2-c5")
@@ -150,6 +152,15 @@ def test_table_9_is_that_of_a_loop_at_rest(published: PublishedVariation) -> Non
     assert 5.0 + recovery == pytest.approx(published.recovery_time_s, rel=0.01)
 
 
+@pytest.mark.parametrize("published", VARIATIONS, ids=lambda variation: f"{variation.controller}-{variation.a}")
+def test_table_9_comes_out_closer_in_the_inferred_simulation(published: PublishedVariation) -> None:
+    _, case, gains = inferred(row_of("sprott", published.controller))
+    peak, iae, recovery = variation_metrics(gains, published.a, SETTLED_AT, case)
+    assert iae == pytest.approx(published.iae, rel=1e-4)
+    assert peak == pytest.approx(published.peak, rel=0.003)
+    assert 5.0 + recovery == pytest.approx(published.recovery_time_s, rel=0.001)
+
+
 def test_the_sprott_disturbance_behind_the_printed_numbers_is_5() -> None:
     table = findings.sprott_disturbance().table
     assert table is not None
@@ -161,7 +172,7 @@ def test_the_sprott_disturbance_behind_the_printed_numbers_is_5() -> None:
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.case == "p1-c0.5"], ids=lambda row: row.controller)
 def test_process_1_comes_out_in_the_inferred_simulation(row: Published) -> None:
-    _, case, gains = findings.inferred(row)
+    _, case, gains = inferred(row)
     ours, (settling, recovery) = measure(case, gains), findings.transient_times(case, gains)
     assert ours.number("overshoot_percent") == pytest.approx(row.overshoot_percent, abs=0.4)
     for metric in ("iae_setpoint", "peak", "iae_disturbance"):
@@ -171,7 +182,7 @@ def test_process_1_comes_out_in_the_inferred_simulation(row: Published) -> None:
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.case == "sprott"], ids=lambda row: row.controller)
 def test_the_sprott_circuit_comes_out_in_the_inferred_simulation(row: Published) -> None:
-    _, case, gains = findings.inferred(row)
+    _, case, gains = inferred(row)
     ours = measure(case, gains)
     assert ours.number("overshoot_percent") == pytest.approx(row.overshoot_percent, abs=0.6)
     assert ours.number("settling_time_s") == pytest.approx(row.settling_time_s, abs=0.011)
@@ -180,7 +191,7 @@ def test_the_sprott_circuit_comes_out_in_the_inferred_simulation(row: Published)
 
 def test_the_inferred_simulation_is_a_filter_advanced_before_it_is_used() -> None:
     row = row_of("p1-c0.5", "tdof_npid2")
-    _, case, gains = findings.inferred(row)
+    _, case, gains = inferred(row)
     h, filter_time = case.sample_period, row.kd / row.kp / published_gains(row).n
     c, _ = coefficients(gains, h)
     phi = math.exp(-h / filter_time)
@@ -192,6 +203,38 @@ def test_most_rows_come_out_in_the_inferred_simulation() -> None:
     assert "17 of 21 rows agree" in findings.papers_simulation({row.case for row in ROWS}).paragraphs[0]
 
 
+@pytest.mark.parametrize("row", [row for row in ROWS if row.case == "p1-c0.5"], ids=lambda row: row.controller)
+def test_printed_gains_are_optimal_in_the_inferred_simulation_only(row: Published) -> None:
+    assert optimality(row, inferred).excess_percent <= OPTIMAL
+    assert optimality(row, as_stated).excess_percent > 5.0
+
+
 def test_a_table_shows_repeated_keys_once() -> None:
     table = Table("t", "T", ("process", "controller", "Δ (%)"), (("a", "x", 1.25), ("a", "y", None)), 1)
     assert table.shown() == [["a", "x", "+1.2"], ["", "y", "–"]]
+
+
+@pytest.mark.parametrize(
+    ("cell", "heading", "text"),
+    [
+        (4.0, "t (s)", "4.000"),
+        (0.008, "M", "0.008"),
+        (1500.0, "K_i", "1500"),
+        (2e-6, "M", "0"),
+        (-0.024, "Δ (%)", "-0.02"),
+    ],
+)
+def test_numbers_are_shown_with_as_many_digits_as_help(cell: float, heading: str, text: str) -> None:
+    assert shown_cell(cell, heading) == text
+
+
+def test_symbols_have_subscripts_in_the_page() -> None:
+    page = html_page("T", [Section("S", ("**Which.** IAE_SP < K_p",))], Path())
+    assert "<p><strong>Which.</strong> IAE<sub>SP</sub> &lt; K<sub>p</sub></p>" in page
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_search_bounds_hold_the_printed_gains(case: str) -> None:
+    for row in (row for row in ROWS if row.case == case):
+        for name, (lower, upper) in paper_case(case).bounds.items():
+            assert name == "sigma" or lower <= getattr(row, name) <= upper

@@ -1,0 +1,116 @@
+"""A live controller's efforts beside the recorded ones."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tdof_npid_ros.analysis.recording import Loop, read_loops
+from tdof_npid_ros.bag import BagError
+from tdof_npid_ros.bag.reader import BagReader
+
+Key = tuple[str, int]  # episode and stamp in ns
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The recorded answers by episode and stamp: digest of the parameters, and effort, (lanes,)."""
+
+    answers: Mapping[Key, tuple[str, np.ndarray]]
+
+    @classmethod
+    def read(cls, reader: BagReader, bag: str) -> Recorded:
+        """The answers in a bag.
+
+        Raises:
+            BagError: there are none, or the bag is damaged.
+        """
+        loops = [loop for loop in read_loops(reader, bag) if loop.control_effort is not None]
+        if not loops:
+            raise BagError(f"{bag}: no control efforts in it to compare with: replay it without compare")
+        return cls({key: answer for loop in loops for key, answer in _answers(loop).items()})
+
+    def key(self, output: bytes) -> Key | None:
+        """Episode and stamp of a serialized output, if the recorded controller answered it."""
+        order = "<" if output[1] else ">"
+        seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", output, 4)
+        episode = output[16 : 16 + max(length - 1, 0)].decode()
+        key = episode, seconds * 1_000_000_000 + nanoseconds
+        return key if key in self.answers else None
+
+
+@dataclass
+class Comparison:
+    """How live answers compare with the recorded ones.
+
+    Attributes:
+        equal, different: answers, bit for bit.
+        largest: difference, in the effort's unit.
+        other_parameters: digests of live answers that were not computed with the recorded parameters.
+        failure: why the comparison ended early.
+    """
+
+    equal: int = 0
+    different: int = 0
+    largest: float = 0.0
+    first: str = ""
+    other_parameters: set[str] = field(default_factory=set)
+    failure: str = ""
+
+    @property
+    def sound(self) -> bool:
+        """Whether something was compared, and differs only where the parameters do."""
+        return not self.failure and self.equal + self.different > 0 and (not self.different or bool(self.other_parameters))
+
+    def take(self, recorded: Recorded, key: Key, digest: str, effort: np.ndarray) -> None:
+        """Compare one live answer, effort (lanes,)."""
+        if key not in recorded.answers:
+            return
+        its_digest, expected = recorded.answers[key]
+        if digest != its_digest:
+            self.other_parameters.add(digest)
+        if effort.tobytes() == expected.tobytes():
+            self.equal += 1
+            return
+        self.different += 1
+        if not self.first:
+            self.first = f"at {key[1] / 1e9:.9g} s of {key[0] or 'the recording'}: {effort.tolist()}, recorded {expected.tolist()}"
+        if effort.shape == expected.shape:
+            self.largest = max(self.largest, float(np.abs(effort - expected).max()))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON and diagnostics."""
+        return {
+            "equal": self.equal,
+            "different": self.different,
+            "largest_difference": self.largest,
+            "first_difference": self.first,
+            "other_parameters": sorted(self.other_parameters),
+            "failure": self.failure,
+        }
+
+    def lines(self) -> list[str]:
+        """For people; nothing where nothing was compared."""
+        lines = [self.failure] if self.failure else []
+        if self.equal + self.different:
+            lines.append(f"{self.equal} control efforts equal bit for bit, {self.different} differ, by {self.largest:g} at most")
+        if self.first:
+            lines.append(f"  first {self.first}")
+        if self.other_parameters:
+            lines.append(f"  the live controller has other parameters: {', '.join(sorted(self.other_parameters))}")
+        return lines
+
+
+def _answers(loop: Loop) -> dict[Key, tuple[str, np.ndarray]]:
+    """By episode and stamp; of answers given twice the first, of stamps that come again the last episode."""
+    signal = loop.control_effort
+    assert signal is not None
+    found: dict[Key, tuple[str, np.ndarray]] = {}
+    for frame, stamp, effort in zip(signal.frame_id.tolist(), signal.stamp_ns.tolist(), signal.effort, strict=True):
+        digest, _, episode = frame.partition(" ")
+        found[episode, stamp] = digest, np.asarray(effort, dtype=np.float64)
+    return found

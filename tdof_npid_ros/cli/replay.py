@@ -1,0 +1,38 @@
+"""`tdof-npid replay`: publish a bag again over ROS 2."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from tdof_npid_ros.graph.replay_node import replay
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument("bag", metavar="BAG", help="bag folder, .mcap or .db3 file")
+    parser.add_argument("--rate", type=float, default=1.0, help="times the recorded speed (default 1)")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds of the recording to leave out")
+    parser.add_argument("--loop", action="store_true", help="begin again at the end")
+    parser.add_argument("--clock", action="store_true", help="publish /clock")
+    parser.add_argument("--namespace", default="/", help="where to publish (default /)")
+    parser.add_argument(
+        "--compare",
+        action="store_true",
+        help="give the recorded outputs to a live controller, as fast as it answers, and compare its efforts; "
+        "0 if they are equal, or differ because its parameters do",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Replay to the end, or to Ctrl-C."""
+    parameters = {name: getattr(arguments, name) for name in ("bag", "rate", "start", "loop", "clock", "compare")}
+    ros = ["--ros-args", "-r", f"__ns:={arguments.namespace}"]
+    for name, value in parameters.items():
+        ros += ["-p", f"{name}:={json.dumps(value)}"]
+    status, comparison = replay(["replay", *ros])
+    if arguments.json:
+        print(json.dumps(comparison.as_dict()))
+    elif comparison.lines():
+        print("\n".join(comparison.lines()))
+    return status

@@ -1,0 +1,213 @@
+"""The replay: publishes a bag again, at will against a live controller whose efforts it compares with the recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from tdof_npid_ros.analysis.compare import Comparison, Recorded
+from tdof_npid_ros.bag import BagError
+from tdof_npid_ros.bag.reader import BagReader, Message
+from tdof_npid_ros.graph.messages import set_stamp, stamp_ns, values
+from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
+from tdof_npid_ros.graph.tap import message_class
+
+SECOND = 1_000_000_000  # ns
+CLOCK = "/clock"
+NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
+FOR_CONTROLLER = ("scenario_plan", "setpoint", "output")  # what a controller is given
+MATCH_TIMEOUT = 10.0  # s until subscribers must have come, where an answer is needed
+REPLY_TIMEOUT = 0.5  # s until an output is published again
+RETRIES = 20
+
+
+class ReplayNode(LoopNode):
+    """Publishes a bag's messages at their recorded distances, as the bytes that they are in the bag.
+
+    With `compare`, only what a controller is given: each output waits for the answer to the one before, and the answer
+    is compared with the recorded one. Parameters are not applied: with those of the recording the efforts are equal
+    bit for bit, with others the comparison tells how much they differ.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("replay")
+        declare = self.declare_value
+        self.bag = Path(str(declare("bag", "", "the bag to publish again", fixed=True)))
+        self.rate = number("rate", declare("rate", 1.0, "times the recorded speed, above 0", fixed=True), low=1e-6)
+        self.start = number("start", declare("start", 0.0, "s of the recording to leave out", fixed=True), low=0.0)
+        self.loop = bool(declare("loop", False, "begin again at the end", fixed=True))
+        self.clock = bool(declare("clock", False, "publish /clock, as recorded, else the time of recording", fixed=True))
+        self.compare = bool(declare("compare", False, "compare a live controller's efforts with the recorded", fixed=True))
+        self.accept_changes()
+        try:
+            self.reader = BagReader(self.bag)
+            self.recorded = Recorded.read(self.reader, str(self.bag)) if self.compare else None
+        except BagError as error:
+            raise ValueError(str(error)) from None
+        self.comparison = Comparison()
+        self.finished = False
+
+    def activate(self) -> None:
+        """Publish from a thread, so that the node stays at hand."""
+        self.stopping = threading.Event()
+        self.answered = threading.Condition()
+        self.answer: tuple[str, int] | None = None
+        self.publishers_of = {topic: publisher for topic in self._topics() for publisher in [self._publisher(topic)]}
+        self.clock_publisher = self.create_publisher(Clock, CLOCK, 10) if self.clock else None
+        if self.compare:
+            self.create_subscription(JointState, "control_effort", self._on_answer, SIGNAL_QOS)
+        self.thread = threading.Thread(target=self._play, name="replay", daemon=True)
+        self.thread.start()
+
+    def deactivate(self) -> None:
+        """Stop publishing."""
+        self.stopping.set()
+        self.thread.join()
+        self.reader.close()
+
+    # What is published
+
+    def _topics(self) -> list[str]:
+        wanted = [topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic]
+        if self.compare:
+            wanted = [topic for topic in wanted if self._relative(topic) in FOR_CONTROLLER]
+        return wanted
+
+    def _relative(self, topic: str) -> str:
+        """A topic's name in the recorded loop's namespace."""
+        return topic.removeprefix(self.reader.custom_data.get("namespace", "/").rstrip("/") + "/")
+
+    def _publisher(self, topic: str) -> Publisher:
+        info = self.reader.topics[topic]
+        qos = LATCHED_QOS if "transient_local" in info.qos else SIGNAL_QOS
+        return self.create_publisher(message_class(info.type), self._relative(topic), qos)
+
+    # Playing, in the thread
+
+    def _play(self) -> None:
+        try:
+            if self.compare:
+                self._wait_for_controller()
+            self._play_through()
+            while self.loop and not self.stopping.is_set():
+                self._play_through()
+        except (BagError, TimeoutError) as error:
+            self.get_logger().error(str(error))
+            self.comparison.failure = str(error)
+        self.finished = not self.stopping.is_set()
+        rclpy.try_shutdown()
+
+    def _play_through(self) -> None:
+        first_ns = self.reader.start_ns + round(self.start * SECOND)
+        began = time.monotonic()
+        for topic, log_ns, _, data in self._messages(first_ns):
+            if not self.compare:
+                due = began + (log_ns - first_ns) / SECOND / self.rate
+                if self.stopping.wait(max(0.0, due - time.monotonic())):
+                    return
+            self._publish(topic, log_ns, bytes(data))
+            if self.stopping.is_set():
+                return
+
+    def _messages(self, first_ns: int) -> Iterator[Message]:
+        """From a time on; before it, what a latecomer would still be given."""
+        latched = [topic for topic in self.publishers_of if "transient_local" in self.reader.topics[topic].qos]
+        for message in self.reader.messages(latched, stop_ns=first_ns) if latched and self.start else ():
+            yield message[0], first_ns, message[2], message[3]
+        topics = [*self.publishers_of, *([CLOCK] if self.clock and CLOCK in self.reader.topics else [])]
+        yield from self.reader.messages(topics, start_ns=first_ns)
+
+    def _publish(self, topic: str, log_ns: int, data: bytes) -> None:
+        if self.clock_publisher is not None and (topic == CLOCK or CLOCK not in self.reader.topics):
+            self._publish_clock(topic, log_ns, data)
+        if topic == CLOCK:
+            return
+        if self.compare and self._relative(topic) == "output":
+            self._publish_and_wait(topic, data)
+        else:
+            self.publishers_of[topic].publish(data)
+        self.counts["published"] += 1
+
+    def _publish_clock(self, topic: str, log_ns: int, data: bytes) -> None:
+        assert self.clock_publisher is not None
+        message = Clock()
+        set_stamp(message.clock, log_ns)
+        self.clock_publisher.publish(data if topic == CLOCK else message)
+
+    # Comparing
+
+    def _wait_for_controller(self) -> None:
+        output = next(p for topic, p in self.publishers_of.items() if self._relative(topic) == "output")
+        self._until(lambda: bool(output.get_subscription_count()), MATCH_TIMEOUT, "no controller takes output")
+
+    def _publish_and_wait(self, topic: str, data: bytes) -> None:
+        assert self.recorded is not None
+        expected = self.recorded.key(data)
+        if expected is None:
+            return  # the recorded controller did not answer it either
+        for _ in range(RETRIES):
+            self.publishers_of[topic].publish(data)
+            with self.answered:
+                if self.answered.wait_for(lambda: self.answer == expected or self.stopping.is_set(), REPLY_TIMEOUT):
+                    return
+        raise TimeoutError(f"no answer to the output at {expected[1] / SECOND:g} s: start a controller in this namespace")
+
+    def _on_answer(self, message: JointState) -> None:
+        assert self.recorded is not None
+        digest, _, episode = message.header.frame_id.partition(" ")
+        key = episode, stamp_ns(message.header.stamp)
+        with self.answered:
+            if key != self.answer:
+                self.comparison.take(self.recorded, key, digest, values(message.effort))
+                self.answer = key
+                self.answered.notify()
+
+    def _until(self, condition: Callable[[], bool], timeout: float, otherwise: str) -> None:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                raise TimeoutError(f"{otherwise}: start one in this namespace")
+            if self.stopping.wait(0.02):
+                return
+
+    def state(self) -> tuple[int, str, dict[str, object]]:
+        """What is replayed, and how the comparison stands."""
+        facts: dict[str, object] = {"bag": self.bag, "rate": self.rate}
+        return OK, f"replaying {self.bag}", facts | (self.comparison.as_dict() if self.compare else {})
+
+
+def replay(arguments: list[str]) -> tuple[int, Comparison]:
+    """Run the node to its end; returns its exit status and what it compared."""
+    nodes: list[ReplayNode] = []
+
+    def make() -> ReplayNode:
+        nodes.append(ReplayNode())
+        return nodes[0]
+
+    status: Any = 0
+    try:
+        run_node(make, arguments)
+    except SystemExit as end:
+        status = end.code or 0
+    comparison = nodes[0].comparison if nodes else Comparison()
+    if status == 0 and nodes and nodes[0].compare and not comparison.sound:
+        status = 1
+    return int(status), comparison
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    status, comparison = replay(sys.argv if args is None else args)
+    with contextlib.suppress(BrokenPipeError):
+        print("\n".join(comparison.lines()), flush=True)
+    sys.exit(status)

@@ -1,0 +1,1 @@
+"""The folder's helpers are imported by name."""

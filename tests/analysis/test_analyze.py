@@ -1,0 +1,241 @@
+"""`analyze`: every episode of a bag, measured, compared, drawn, as the in-process simulation says it must be."""
+
+import base64
+import csv
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loop_bags import JOINT_STATE, STEP_NS, TYPES, LoopBag, joint_state
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+
+from tdof_npid_ros.analysis import AnalysisError
+from tdof_npid_ros.analysis.report import analyze
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.cli import main
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return load_case("p1-c0.5")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory, case) -> Path:
+    folder = tmp_path_factory.mktemp("bags") / "bag"
+    with LoopBag(folder) as writer:
+        writer.configuration(case, case.gains)
+        writer.episode(case, case.gains, "setpoint", 1)
+        writer.episode(case, case.gains, "disturbance", 2)
+    return folder
+
+
+def test_metrics_are_those_of_the_simulation(bag, case) -> None:
+    setpoint, disturbance = analyze([bag]).episodes
+    assert setpoint.metrics() == case.setpoint_response()
+    assert disturbance.metrics() == case.disturbance_response()
+    assert (setpoint.episode.name, disturbance.episode.name) == ("setpoint", "disturbance")
+    assert setpoint.episode.gains == (case.gains,)
+
+
+def test_a_lockstep_run_is_the_simulation_bit_for_bit(bag) -> None:
+    assert all(report.deviation.output == report.deviation.control_effort == 0.0 for report in analyze([bag]).episodes)
+
+
+def test_effort_use(bag, case) -> None:
+    use = analyze([bag]).episodes[0].effort[0]
+    u = case.simulate("setpoint").control_effort[:, 0]
+    assert use.total_variation == np.abs(np.diff(u)).sum()
+    assert (use.peak, use.saturated_share) == (np.abs(u).max(), 0.0)
+
+
+def test_share_of_time_at_a_limit(tmp_path, case) -> None:
+    gains = case.gains.with_values(effort_max=2.0)
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(case, gains)
+        writer.episode(case, gains, "setpoint", 1)
+    u = case.simulate("setpoint", gains).control_effort[:, 0]
+    assert analyze([tmp_path / "bag"]).episodes[0].effort[0].saturated_share == np.mean(u == 2.0) > 0.05
+
+
+def test_each_change_in_a_plan_is_a_response_of_its_own(tmp_path, case) -> None:
+    plan = ("0 setpoint 1", "5 disturbance 0.5", "10 setpoint 3", "20 end")
+    long = replace(case, episodes={"mixed": plan})
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(long, case.gains)
+        writer.episode(long, case.gains, "mixed", 1)
+    (first, second, third), = analyze([tmp_path / "bag"]).episodes[0].responses
+    assert [(r.kind, r.start_s, r.end_s) for r in (first, second, third)] == [
+        ("setpoint", 0.0, 5.0), ("disturbance", 5.0, 10.0), ("setpoint", 10.0, 20.0)
+    ]  # fmt: skip
+    # The plant is linear, but the law is not: twice the step is another response.
+    assert second.metrics.peak < case.disturbance_response().peak
+    assert third.metrics.overshoot_percent != first.metrics.overshoot_percent
+
+
+def test_a_change_of_the_plant(tmp_path) -> None:
+    sprott = replace(load_case("sprott"), episodes={"increase": ("0 setpoint 1", "0 plant.a 0.6", "1 plant.a 0.72", "2 end")})
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(sprott, sprott.gains)
+        writer.episode(sprott, sprott.gains, "increase", 1)
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert [response.kind for response in report.responses[0]] == ["setpoint", "plant"]
+    assert report.deviation.output == 0.0
+
+
+def test_a_ramp_has_its_error_only(tmp_path, case) -> None:
+    ramp = replace(case, episodes={"ramp": ("0 setpoint ramp 1 over 2", "4 end")})
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(ramp, case.gains)
+        writer.episode(ramp, case.gains, "ramp", 1)
+    ((response,),) = analyze([tmp_path / "bag"]).episodes[0].responses
+    assert response.kind == "tracking" and response.metrics is None and response.iae > 0
+
+
+def test_outputs_that_are_missing_are_said_to_be(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(case, case.gains)
+        writer.episode(case, case.gains, "setpoint", 1, lost=range(10, 13))
+    report = analyze([tmp_path / "bag"])
+    assert report.episodes[0].episode.missing == 3
+    assert report.episodes[0].metrics() is None
+    assert "3 outputs are missing from the bag" in report.table()
+
+
+def test_lanes(tmp_path, case) -> None:
+    gains = case.gains.with_values(kp=(9.426, 5.0, 2.0))
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(case, gains)
+        writer.episode(case, gains, "setpoint", 1)
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert report.metrics(0) == case.setpoint_response()
+    assert report.metrics(1) == case.setpoint_response(case.gains.with_values(kp=5.0))
+    assert report.deviation.output == 0.0
+
+
+def test_two_bags_are_compared(bag, tmp_path, case, capsys) -> None:
+    pid = case.gains.with_values(type="pid")
+    with LoopBag(tmp_path / "other") as writer:
+        writer.configuration(case, pid)
+        writer.episode(case, pid, "setpoint", 1)
+    rows = analyze([bag, tmp_path / "other"]).rows()
+    change = rows[2]["iae_change_percent"]
+    assert change == pytest.approx(100 * (case.setpoint_response(pid).iae / case.setpoint_response().iae - 1))
+    assert main(["analyze", str(bag), str(tmp_path / "other")]) == 0
+    assert "ΔIAE" in capsys.readouterr().out
+
+
+def test_a_loop_in_a_namespace(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag", "/left/") as writer:
+        writer.configuration(case, case.gains)
+        writer.episode(case, case.gains, "setpoint", 1)
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert report.episode.namespace == "/left/" and report.deviation.output == 0.0
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_bags_that_rosbags_wrote(bag, tmp_path, plugin, case) -> None:
+    with BagReader(bag) as reader, RosbagsWriter(tmp_path / "copy", version=9, storage_plugin=plugin) as writer:
+        connections = {
+            topic: writer.add_connection(topic, info.type, typestore=TYPES) for topic, info in reader.topics.items()
+        }
+        for topic, log_time, _, data in reader.messages():
+            writer.write(connections[topic], log_time, bytes(data))
+    setpoint, _ = analyze([tmp_path / "copy"]).episodes
+    assert setpoint.metrics() == case.setpoint_response() and setpoint.deviation.output == 0.0
+    assert main(["verify", str(tmp_path / "copy")]) == 0
+
+
+def test_a_robot_without_plan_or_controller(tmp_path) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        for k in range(100):
+            data = joint_state(1_000_000_000 + 10_000_000 * k, "base_link", [0.1 * k, 1.0], [0.0, 0.0])
+            writer.write("joint_states", JOINT_STATE, data)
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert (report.episode.name, report.episode.lanes, len(report.episode.time)) == ("recording", 2, 100)
+    assert "recording #1" in analyze([tmp_path / "bag"]).table()
+
+
+def test_a_realtime_loop_takes_setpoint_and_disturbance_from_their_topics(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(case, case.gains)
+        run = replace(case, episodes={"s": ("0 setpoint 1", "5 disturbance 1", "10 end")}).simulate("s")
+        for k in range(len(run.time)):
+            stamp = k * case.sample_period_ns
+            if k in (0, 1000):
+                writer.write("disturbance", JOINT_STATE, joint_state(0, "", (), [run.disturbance[k]]))
+            writer.write("output", JOINT_STATE, joint_state(stamp, "", run.output[k]))
+            answer = joint_state(stamp, "abc", [run.setpoint[k]], run.control_effort[k])
+            writer.write("control_effort", JOINT_STATE, answer)
+    ((setpoint, disturbance),) = analyze([tmp_path / "bag"]).episodes[0].responses
+    assert (setpoint.kind, disturbance.kind, disturbance.start_s) == ("setpoint", "disturbance", 5.0)
+    assert disturbance.metrics.peak > 0.05
+    assert STEP_NS
+
+
+def test_a_bag_without_outputs_is_refused(tmp_path, capsys) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.write("setpoint", JOINT_STATE, joint_state(0, "", [1.0]))
+    with pytest.raises(AnalysisError, match="no output"):
+        analyze([tmp_path / "bag"])
+    assert main(["analyze", str(tmp_path / "bag")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_files_and_json(bag, tmp_path, capsys, case) -> None:
+    files = {name: tmp_path / f"a.{name}" for name in ("png", "html", "csv")}
+    options = [word for name, path in files.items() for word in (f"--{name}", str(path))]
+    assert main(["analyze", str(bag), "--json", *options]) == 0
+    episodes = json.loads(capsys.readouterr().out)["episodes"]
+    assert episodes[0]["lanes"][0]["responses"][0]["iae"] == case.setpoint_response().iae
+    assert files["png"].read_bytes().startswith(PNG) and files["png"].stat().st_size > 10_000
+    rows = list(csv.DictReader(files["csv"].open()))
+    assert float(rows[0]["iae"]) == case.setpoint_response().iae
+    page = files["html"].read_text()
+    assert not re.search(r"(src|href)=|https?://|@import", page), "the page must need nothing else"
+    curves = json.loads(re.search(r"const PLOTS = (.*);\n", page).group(1))
+    data = np.frombuffer(base64.b64decode(curves[0]["curves"][0]["output"]["data"]))
+    assert np.array_equal(data[len(data) // 2 :], case.simulate("setpoint").output[:, 0])
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_the_page_works_in_a_browser(bag, tmp_path) -> None:
+    """Loaded from disk in a headless browser: both groups draw, a drag zooms, a checkbox hides, hovering tells values."""
+    analyze([bag]).html(tmp_path / "a.html")
+    steps = """
+    const canvas = document.querySelector('canvas'), box = canvas.getBoundingClientRect();
+    const ink = c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.reduce((a, v, i) => a + (i % 4 == 3 && v > 0), 0);
+    const fire = (type, share) => canvas.dispatchEvent(new PointerEvent(type, {clientX: box.left + 62 + share * (box.width - 84), pointerId: 1}));
+    canvas.setPointerCapture = () => {};
+    const found = {drawn: [...document.querySelectorAll('canvas')].map(ink), whole: [...groups[0].range]};
+    fire('pointerdown', 0.2); fire('pointermove', 0.4); fire('pointerup', 0.4);
+    found.zoomed = [...groups[0].range];
+    fire('pointermove', 0.5);
+    found.values = document.querySelector('.values').textContent;
+    const before = ink(canvas);
+    document.querySelector('input').click();
+    found.hidden = ink(canvas) < before;
+    canvas.dispatchEvent(new MouseEvent('dblclick'));
+    found.again = [...groups[0].range];
+    document.title = JSON.stringify(found);
+    """
+    page = (tmp_path / "a.html").read_text().replace("</body>", f"<script>{steps}</script></body>")
+    (tmp_path / "b.html").write_text(page)
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
+    dom = subprocess.run([*command, (tmp_path / "b.html").as_uri()], capture_output=True, text=True, timeout=60).stdout
+    found = json.loads(re.search(r"<title>(.*?)</title>", dom, re.DOTALL).group(1))
+    assert len(found["drawn"]) == 4 and all(pixels > 1000 for pixels in found["drawn"])
+    assert found["whole"] == found["again"] == [0, 25]
+    assert found["zoomed"] == pytest.approx([5, 10], abs=0.2)
+    assert "t = 7.5" in found["values"] and "TDOF-NPID2 #1 output 0.99" in found["values"] or "1.00" in found["values"]
+    assert found["hidden"]

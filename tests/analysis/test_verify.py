@@ -1,0 +1,145 @@
+"""E2: `verify` finds every bit that is off, and says what it could not check."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_bags import JOINT_STATE, LoopBag, joint_state
+
+from tdof_npid_ros.analysis import AnalysisError, verify
+from tdof_npid_ros.analysis.verify import NO_PARAMETERS, UNKNOWN_STATE
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.cli import main
+from tdof_npid_ros.control.controller import Controller
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return replace(load_case("p1-c0.5"), episodes={"setpoint": ("0 setpoint 1", "2 end"), "disturbance": ("0 disturbance 1", "2 end")})
+
+
+def write(folder, case, gains=None, **options) -> None:
+    gains = gains or case.gains
+    with LoopBag(folder) as bag:
+        bag.configuration(case, gains)
+        bag.episode(case, gains, "setpoint", 1, **options)
+        bag.episode(case, gains, "disturbance", 2)
+
+
+def test_a_sound_bag_is_verified_step_by_step(tmp_path, case, capsys) -> None:
+    write(tmp_path / "bag", case)
+    account = verify.verify(tmp_path / "bag")
+    assert (account.equal, account.different, account.unverifiable) == (802, 0, {})
+    assert main(["verify", str(tmp_path / "bag")]) == 0
+    assert "802 control efforts verified" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["pid", "npid", "tdof_npid1", "tdof_npid2"])
+@pytest.mark.parametrize("limits", [(-np.inf, np.inf), (-2.0, 3.0)])
+def test_every_type_of_controller_many_lanes(tmp_path, case, kind, limits) -> None:
+    gains = case.gains.with_values(type=kind, kp=(9.0, 5.0, 2.0), effort_min=limits[0], effort_max=limits[1])
+    write(tmp_path / "bag", case, gains)
+    assert verify.verify(tmp_path / "bag").equal == 802
+
+
+def test_one_bit_in_one_effort_is_found_and_named(tmp_path, case, capsys) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        original, seen = bag.write, []
+
+        def tampered(topic: str, type_name: str, data: bytes) -> None:
+            seen.append(topic)
+            if topic == "control_effort" and seen.count(topic) == 100:
+                data = data[:-8] + bytes([data[-8] ^ 1]) + data[-7:]
+            original(topic, type_name, data)
+
+        bag.write = tampered  # type: ignore[method-assign]
+        bag.configuration(case, case.gains)
+        bag.episode(case, case.gains, "setpoint", 1)
+    account = verify.verify(tmp_path / "bag")
+    assert (account.equal, account.different) == (400, 1)
+    assert account.first is not None and account.first.step == 99
+    assert account.first.stamp_ns == 99 * case.sample_period_ns
+    assert main(["verify", str(tmp_path / "bag")]) == 1
+    printed = capsys.readouterr().out
+    assert "first difference: control effort in /control_effort, message 99, at 0.495 s" in printed
+    assert "kp" in printed and "proportional" in printed
+
+
+def test_a_setpoint_that_is_not_the_plans_is_found(tmp_path, case) -> None:
+    other = replace(case, episodes={"setpoint": ("0 setpoint 1", "1 setpoint 1.5", "2 end")})
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        run, plan = other.simulate("setpoint"), case.plans["setpoint"]
+        from loop_bags import TRAJECTORY, plan_message
+
+        from tdof_npid_ros.control.controller import parameters_digest
+
+        bag.write("scenario_plan", TRAJECTORY, plan_message(plan))
+        digest = parameters_digest(case.gains, case.sample_period_ns)
+        for k in range(len(run.time)):
+            stamp, frame = k * case.sample_period_ns, f"{plan.digest}/1"
+            bag.write("output", JOINT_STATE, joint_state(stamp, frame, run.output[k]))
+            answer = joint_state(stamp, f"{digest} {frame}", [run.setpoint[k]], run.control_effort[k])
+            bag.write("control_effort", JOINT_STATE, answer)
+    account = verify.verify(tmp_path / "bag")
+    assert account.first is not None and account.first.what == "setpoint"
+    assert account.first.stamp_ns == 10**9 and account.different == 201
+
+
+def test_after_lost_answers_the_rest_of_the_episode_is_not_verifiable(tmp_path, case) -> None:
+    write(tmp_path / "bag", case, lost=range(100, 103))
+    account = verify.verify(tmp_path / "bag")
+    assert (account.equal, account.different) == (100 + 401, 0)
+    assert account.unverifiable == {UNKNOWN_STATE: 298}
+
+
+def test_a_bag_without_parameters_verifies_nothing_and_fails(tmp_path, case, capsys) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.episode(case, case.gains, "setpoint", 1)
+    assert verify.verify(tmp_path / "bag").unverifiable == {NO_PARAMETERS: 401}
+    assert main(["verify", str(tmp_path / "bag")]) == 1
+    assert "nothing was verified" in capsys.readouterr().out
+
+
+def test_gains_that_change_during_an_episode(tmp_path, case) -> None:
+    """Realtime, from live setpoints; the answers bear the digest of what they were computed with."""
+    changed = case.gains.with_values(kp=5.0, alpha=0.1)
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(300):
+            if k == 150:
+                controller.change_gains(changed)
+            if k == 160:  # the event arrives late
+                bag.parameters("controller", {"kp": 5.0, "alpha": 0.1})
+            y = np.array([np.sin(k / 30)])
+            controller.answer(k * case.sample_period_ns, np.ones(1), y)
+            bag.write("output", JOINT_STATE, joint_state(k * case.sample_period_ns, "", y))
+            answer = joint_state(k * case.sample_period_ns, controller.digest, [1.0], controller.effort)
+            bag.write("control_effort", JOINT_STATE, answer)
+    assert verify.verify(tmp_path / "bag").equal == 300
+
+
+def test_a_controller_that_is_restarted_begins_afresh(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(200):
+            if k == 120:
+                controller.reset()
+                bag._sequence["/control_effort"] = 0
+            y = np.array([np.cos(k / 30)])
+            controller.answer(k * case.sample_period_ns, np.ones(1), y)
+            bag.write("output", JOINT_STATE, joint_state(k * case.sample_period_ns, "", y))
+            answer = joint_state(k * case.sample_period_ns, controller.digest, [1.0], controller.effort)
+            bag.write("control_effort", JOINT_STATE, answer)
+    assert verify.verify(tmp_path / "bag").equal == 200
+
+
+def test_a_bag_without_efforts_is_refused(tmp_path) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.write("output", JOINT_STATE, joint_state(0, "", [1.0]))
+    with pytest.raises(AnalysisError, match="no control efforts"):
+        verify.verify(tmp_path / "bag")
+
+
