@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -61,6 +62,15 @@ def entry_point(function: F) -> F:
         return cast(F, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
     finally:
         numba.config.CACHE_DIR = before
+
+
+@cache
+def uncached(entry: Any) -> Any:
+    """An entry point whose machine code is not kept: for what a user's class is compiled into.
+
+    A cache that names a class of the user's could not even be read where that class cannot be imported.
+    """
+    return numba.njit(error_model="numpy", nogil=True)(entry.py_func)
 
 
 def _cache_root(configured: str) -> Path:

@@ -20,7 +20,7 @@ from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
 from tdof_npid_ros.control.operation import Operation
-from tdof_npid_ros.plants.kernels import plant_input, plant_output
+from tdof_npid_ros.plants.kernels import kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
@@ -161,9 +161,9 @@ def _run_block_of(
         arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,
                      gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip
         if width == 1:
-            _run_lane(*arguments)
+            kernel_for(sampled, _run_lane)(*arguments)
         else:
-            _run_block(*arguments, (0,) * width)
+            kernel_for(sampled, _run_block)(*arguments, (0,) * width)
     return rows
 
 

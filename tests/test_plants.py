@@ -1,6 +1,10 @@
 """Plants are discretised exactly, and users bring their own."""
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +112,31 @@ def test_a_users_plant_is_integrated_with_fourth_order_accuracy() -> None:
     ]
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
     assert errors[1] / errors[2] == pytest.approx(16, rel=0.3)
+
+
+def test_a_users_plant_leaves_nothing_in_the_cache_that_others_cannot_read(tmp_path: Path) -> None:
+    """A cached function that names a user's class could not be loaded where that class is not importable."""
+    plants, program = (
+        tmp_path / "my_plants.py",
+        "from tdof_npid_ros.case import load_case; load_case({!r}).simulate('run')",
+    )
+    plants.write_text(
+        "class Lag:\n    parameters = {'rate': 1.0}\n    initial_state = (0.0,)\n"
+        "    @staticmethod\n    def derivative(x, u, d, p):\n        return (p[0] * (u + d - x[0]),)\n"
+        "    @staticmethod\n    def output(x, p):\n        return x[0]\n"
+    )
+    case = tmp_path / "lag.yaml"
+    case.write_text(
+        "/**/plant: {ros__parameters: {model: 'my_plants:Lag'}}\n"
+        "/**/scenario: {ros__parameters: {episodes: [run], plan: {run: ['0 setpoint 1', '1 end']}}}\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONWARNINGS": "error"}
+    for name, path in ((str(case), str(tmp_path)), ("p1-c4", "")):
+        done = subprocess.run(
+            [sys.executable, "-c", program.format(name).replace("'run'", "'run'" if path else "'setpoint'")],
+            env={**environment, "PYTHONPATH": path}, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
 
 
 def test_lanes_of_a_users_plant_are_independent() -> None:

@@ -2,6 +2,7 @@
 
 The recorder tells on `recorded` the stamp that the log of output and answers has reached. The plant keeps at most
 `WINDOW` steps ahead of it, fewer than the messages that publishers keep for a slow reader; so none is overwritten.
+An episode begins and ends with its first and its last answer in the log.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ class Log:
         self._episode, self._stamp_ns = "", 0
         node.create_subscription(JointState, TOPIC, self._on_recorded, SIGNAL_QOS)
 
-    def has_begun(self, episode: str) -> bool:
-        """Whether the episode's first output and answer are in the log."""
-        return self._episode in (episode, NO_LOG)
+    def holds(self, episode: str, time_ns: int) -> bool:
+        """Whether the output of that time and its answer are in the log."""
+        return self._episode == NO_LOG or (self._episode == episode and self._stamp_ns >= time_ns)
 
     def is_near(self, time_ns: int) -> bool:
         """Whether the output of `time_ns` of an episode that has begun may be published."""

@@ -37,7 +37,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
 
 
-class LoopNode(LifecycleNode):
+class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     """A managed node of the loop.
 
     Subclasses declare their parameters in `__init__`, check changes in `checked` and take them over in `changed`,

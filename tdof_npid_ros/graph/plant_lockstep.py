@@ -84,8 +84,8 @@ class LockstepPlant:
             return
         if not node.is_sound(message.effort, "control_effort"):
             return
-        if self.log is not None and not self.log.has_begun(episode.name):
-            return  # not even the first answer must be missing: it comes again
+        if not self._is_logged(episode):
+            return  # it comes again
         if self.stopped:
             node.get_logger().info("the controller answers again: going on")
             self.running, self.stopped = True, False
@@ -106,16 +106,23 @@ class LockstepPlant:
     def _on_log_grown(self) -> None:
         if not self.running or self.episode is None:
             return
-        if self.episode.stamp_ns == 0:
-            self._repeat_output(self.episode)
-        elif self.held:
+        if self.held:
             self._publish_when_logged(self.episode)
+        elif self._is_end(self.episode) and self._is_logged(self.episode):
+            self._repeat_output(self.episode)  # for the answer that was not taken yet
+
+    def _is_logged(self, episode: Episode) -> bool:
+        """Whether an answer may be taken: the first and the last one not before they are in the log."""
+        return self.log is None or not self._is_end(episode) or self.log.holds(episode.name, episode.stamp_ns)
+
+    def _is_end(self, episode: Episode) -> bool:
+        return episode.stamp_ns in (0, episode.steps * self._node.period_ns)
 
     def _on_reply_timeout(self) -> None:
         node, episode = self._node, self.episode
         if not self.running or episode is None:
             return
-        if self.log is not None and (self.held or not self.log.has_begun(episode.name)):
+        if self.held or not self._is_logged(episode):
             node.refuse("held_up", "lossless: waiting for the recorder; start one with lossless in this namespace")
             if not self.held:
                 node.publish_output(episode.stamp_ns)

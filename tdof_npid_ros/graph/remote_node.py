@@ -15,7 +15,7 @@ from tdof_npid_ros.graph.node import plain
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.live import LoopLostError
 
-RESEND = 1.0  # s until a request is sent again; every request here may arrive twice
+RESEND = 4.0  # s until a request is sent again, longer than DDS takes to repair a loss; all here may arrive twice
 
 
 class RemoteNode:
@@ -89,7 +89,7 @@ class RemoteNode:
             answered = threading.Event()
             future = client.call_async(request)
             future.add_done_callback(lambda _, answered=answered: answered.set())
-            if answered.wait(RESEND):
+            if answered.wait(min(RESEND, end - time.monotonic())):
                 return future.result()
             client.remove_pending_request(future)
         raise LoopLostError(f"{service} did not answer within {self._answer_timeout:g} s")

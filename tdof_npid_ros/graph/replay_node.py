@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import sys
 import threading
 import time
@@ -10,7 +12,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -55,14 +56,13 @@ class ReplayNode(LoopNode):
         except BagError as error:
             raise ValueError(str(error)) from None
         self.comparison = Comparison()
-        self.finished = False
 
     def activate(self) -> None:
         """Publish from a thread, so that the node stays at hand."""
         self.stopping = threading.Event()
         self.answered = threading.Condition()
         self.answer: tuple[str, int] | None = None
-        self.publishers_of = {topic: publisher for topic in self._topics() for publisher in [self._publisher(topic)]}
+        self.publishers_of = {topic: self._publisher(topic) for topic in self._topics()}
         self.clock_publisher = self.create_publisher(Clock, CLOCK, 10) if self.clock else None
         if self.compare:
             self.create_subscription(JointState, "control_effort", self._on_answer, SIGNAL_QOS)
@@ -88,9 +88,11 @@ class ReplayNode(LoopNode):
         return topic.removeprefix(self.reader.custom_data.get("namespace", "/").rstrip("/") + "/")
 
     def _publisher(self, topic: str) -> Publisher:
-        info = self.reader.topics[topic]
-        qos = LATCHED_QOS if "transient_local" in info.qos else SIGNAL_QOS
-        return self.create_publisher(message_class(info.type), self._relative(topic), qos)
+        qos = LATCHED_QOS if self._is_latched(topic) else SIGNAL_QOS
+        return self.create_publisher(message_class(self.reader.topics[topic].type), self._relative(topic), qos)
+
+    def _is_latched(self, topic: str) -> bool:
+        return "transient_local" in self.reader.topics[topic].qos or self._relative(topic) == "scenario_plan"
 
     # Playing, in the thread
 
@@ -104,8 +106,7 @@ class ReplayNode(LoopNode):
         except (BagError, TimeoutError) as error:
             self.get_logger().error(str(error))
             self.comparison.failure = str(error)
-        self.finished = not self.stopping.is_set()
-        rclpy.try_shutdown()
+        os.kill(os.getpid(), signal.SIGINT)  # ends the node in order, as Ctrl-C does
 
     def _play_through(self) -> None:
         first_ns = self.reader.start_ns + round(self.start * SECOND)
@@ -121,7 +122,7 @@ class ReplayNode(LoopNode):
 
     def _messages(self, first_ns: int) -> Iterator[Message]:
         """From a time on; before it, what a latecomer would still be given."""
-        latched = [topic for topic in self.publishers_of if "transient_local" in self.reader.topics[topic].qos]
+        latched = [topic for topic in self.publishers_of if self._is_latched(topic)]
         for message in self.reader.messages(latched, stop_ns=first_ns) if latched and self.start else ():
             yield message[0], first_ns, message[2], message[3]
         topics = [*self.publishers_of, *([CLOCK] if self.clock and CLOCK in self.reader.topics else [])]

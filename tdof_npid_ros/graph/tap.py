@@ -34,7 +34,7 @@ class Taken(NamedTuple):
     data: bytes
 
 
-class _NotForExecutors(MutuallyExclusiveCallbackGroup):
+class _NotForExecutors(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]  # rclpy has no type hints
     """A callback group that no executor serves: even its events would wake one for every message."""
 
     def can_execute(self, entity: Any) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tdof_npid_ros.plants.kernels import kernel_for
 from tdof_npid_ros.plants.lanes import advance_lanes, output_lanes
 from tdof_npid_ros.plants.plant import Plant
 
@@ -30,6 +31,7 @@ class PlantSimulator:
         """Go on with other parameters; the state is kept."""
         self._sampled: Any = plant.sampled(self.sample_period_ns)
         self._like = plant.initial_state
+        self._advance_lanes = kernel_for(self._sampled, advance_lanes)
 
     def reset(self, plant: Plant | None = None) -> None:
         """Back to the initial state at time 0, with the parameters of `plant`, by default those at the start."""
@@ -40,11 +42,11 @@ class PlantSimulator:
         self._step = 0
         self.applied_effort = np.zeros(self.lanes)
         self.output = np.zeros(self.lanes)
-        output_lanes(self._sampled, self._like, self._x, self.output)
+        kernel_for(self._sampled, output_lanes)(self._sampled, self._like, self._x, self.output)
 
     def advance(self, effort: np.ndarray, disturbance: np.ndarray) -> None:
         """One step on, under `effort` and `disturbance`, (lanes,) each, held."""
-        advance_lanes(
+        self._advance_lanes(
             self._sampled, self._like, self._x, self._ring, self._step, self.effort_limits,
             effort, disturbance, self.applied_effort, self.output,
         )  # fmt: skip

@@ -27,7 +27,7 @@ from tdof_npid_ros.tuning.study import Study
 REPOSITORY = Path(__file__).resolve().parents[2]
 EPISODES = {"setpoint": ("0 setpoint 1", "0.6 end"), "disturbance": ("0 disturbance 1", "0.6 end")}
 STEPS = 120  # of each episode
-RUN = {"population": 4, "generations": 3, "polish": 4, "seed": 9}
+RUN = {"population": 4, "generations": 10, "polish": 4, "seed": 9}
 LOSS = 5  # per cent of the packets, each way
 TIMEOUT = 100.0  # s
 
@@ -79,6 +79,7 @@ class Hosts:
         environment = {
             **os.environ,
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+            "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "config" / "lossy-network.xml"),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
             "PYTHONPATH": str(REPOSITORY),
         }

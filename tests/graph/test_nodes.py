@@ -26,12 +26,17 @@ SHORT = {
 def run_short(graph: Any, case: str, lanes: int = 1, **controller: Any) -> tuple[np.ndarray, np.ndarray]:
     """Run the short plan of a case; returns its outputs and efforts, (steps + 1, lanes)."""
     from sensor_msgs.msg import JointState
+    from std_srvs.srv import Trigger
 
     outputs, efforts = graph.collect("output", JointState), graph.collect("control_effort", JointState)
     graph.start("plant", case=case, lanes=lanes)
     graph.start("controller", case=case, **controller)
     graph.start("scenario", case=case, episodes=["short"], plan__short=list(SHORT[case]))
     graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 60, "the end of the episode")
+    outputs.clear()  # by now everybody has found everybody: the second episode is seen from its first output on
+    efforts.clear()
+    assert graph.call("plant/reset", Trigger).success
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "finished" and graph.fact("/plant", "episode") == "2", 60)
     steps = load_short(case).signals["short"].steps
     graph.wait_until(lambda: efforts and stamps(efforts)[-1] == stamps(outputs)[-1], what="the last answer")
     y = {s: m.position for s, m in zip(stamps(outputs), outputs, strict=True)}

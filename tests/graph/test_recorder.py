@@ -1,0 +1,150 @@
+"""The recorder: nothing is lost, a bag explains itself, is never overwritten, and disk trouble does not stop the loop."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.analysis.report import analyze
+from tdof_npid_ros.analysis.verify import verify
+from tdof_npid_ros.bag.reader import BagReader
+
+STEPS = int(os.environ.get("RECORDED_STEPS", 2_000))  # 100_000 for the full run
+CASE = "p1-c0.5"
+
+
+def record(graph: Any, bag: Path, steps: int = STEPS, **options: Any) -> Any:
+    """Run one episode with a recorder from the start; returns the stopped recorder."""
+    graph.start("plant", case=CASE, lossless=bool(options.get("lossless", False)))
+    graph.start("controller", case=CASE)
+    recorder = graph.start("recorder", bag=str(bag), **options)
+    graph.wait_for_nodes("/plant", "/controller", "/recorder")
+    plan = ["0 setpoint 1", f"{steps * 0.005} end"]
+    graph.start("scenario", case=CASE, episodes=["run"], plan__run=plan)
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 300, "the end of the episode")
+    time_left = time.monotonic() + 10
+    last = graph.fact("/recorder", "recorded", "0")
+    while time.monotonic() < time_left:  # until the recorder has told of its last messages
+        graph.wait_for_nodes("/recorder")
+        if graph.fact("/recorder", "recorded", "0") == last:
+            break
+        last = graph.fact("/recorder", "recorded", "0")
+    recorder.stop()
+    return recorder
+
+
+def test_lossless_at_full_speed_loses_nothing_and_e1_and_e2_hold(graph: Any, tmp_path: Path) -> None:
+    recorder = record(graph, tmp_path / "bag", lossless=True)
+    assert recorder.log.strip().endswith("0 lost")
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.custom_data["lost"] == "0"
+        assert len(np.unique(reader.columns("/output", ["header.stamp"])["header.stamp"])) == STEPS + 1
+    account = verify(tmp_path / "bag")
+    assert account.sound and account.equal >= STEPS + 1 and not account.unverifiable
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert (report.deviation.output, report.deviation.control_effort, report.episode.missing) == (0.0, 0.0, 0)
+
+
+def test_a_bag_explains_itself(graph: Any, tmp_path: Path) -> None:
+    """Parameters, offered QoS, type hashes, times of publishing and receiving, splits."""
+    record(graph, tmp_path / "bag", 400, max_duration=0.1, exclude=["controller_*"])
+    with BagReader(tmp_path / "bag") as reader:
+        topics = reader.topics
+        assert "/controller_state" not in topics and {"/output", "/rosout", "/scenario_plan"} <= topics.keys()
+        assert "transient_local" in topics["/scenario_plan"].qos
+        assert topics["/output"].type_hash.startswith("RIHS01_")
+        columns = reader.columns("/output", ["header.stamp"])
+        assert (columns["log_time"] > columns["publish_time"]).all()
+        set_ = [p["name"] for row in reader.columns("/parameter_events")["new_parameters"] for p in row]
+        assert {"kp", "model", "episodes", "compression"} <= set(set_)
+    assert len(list((tmp_path / "bag").glob("*.mcap"))) > 1
+
+
+def test_topics_that_appear_later_and_best_effort_ones(graph: Any, tmp_path: Path) -> None:
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64
+
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    graph.wait_for_nodes("/recorder")
+    late = graph.publisher("temperature", Float64)
+    # A robot that offers less than the loop's own nodes.
+    weak = graph.node.create_publisher(
+        JointState, "output", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    graph.wait_until(weak.get_subscription_count, 20, "the recorder to subscribe as best effort")
+    for value in range(5):
+        late.publish(Float64(data=float(value)))
+        weak.publish(JointState(position=[float(value)]))
+    graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > 10, 20, "the recorder to record")
+    recorder.stop()
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.columns("/temperature")["data"].tolist() == [0, 1, 2, 3, 4]
+        assert reader.topics["/output"].count >= 1
+
+
+def test_a_bag_is_never_overwritten(graph: Any, tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    recorder.expected_status = 2
+    graph.wait_until(lambda: recorder.process.poll() is not None, 60, "the recorder to refuse")
+    lines = [line for line in recorder.log.splitlines() if "exists already" in line]
+    assert recorder.process.returncode == 2 and len(lines) == 1
+
+
+def test_a_vanished_folder_is_told_at_once_and_the_loop_goes_on(graph: Any, tmp_path: Path) -> None:
+    graph.start("plant", case=CASE, lossless=True)
+    graph.start("controller", case=CASE)
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"), lossless=True)
+    graph.wait_for_nodes("/plant", "/controller", "/recorder")
+    graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "25 end"])
+    graph.wait_until(lambda: (tmp_path / "bag").is_dir() and int(graph.fact("/plant", "steps", 0)) > 0, 60, "steps")
+    shutil.rmtree(tmp_path / "bag")
+    graph.wait_for_log(recorder, "recording stopped")
+    graph.wait_until(lambda: graph.fact("/recorder", "level") == 2, 20, "an error in the diagnostics")
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 120, "the loop to go on to its end")
+
+
+def test_a_full_disk(graph: Any, tmp_path: Path) -> None:
+    """A file system of 1 MiB; what was written before it was full stays readable."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", disk], capture_output=True, check=False)
+    if mounted.returncode:
+        pytest.skip("mounting a small file system needs root")
+    try:
+        graph.start("plant", case=CASE)
+        graph.start("controller", case=CASE)
+        recorder = graph.start("recorder", bag=str(disk / "bag"), compression="none")
+        graph.wait_for_nodes("/plant", "/controller", "/recorder")
+        graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "25 end"])
+        graph.wait_for_log(recorder, "recording stopped", 60)
+        assert "No space left" in recorder.log
+        recorder.stop()
+        with BagReader(disk / "bag") as reader:
+            assert len(reader.columns("/output")["log_time"]) > 100
+    finally:
+        for process in graph.processes:
+            process.stop()
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_a_killed_recorder_leaves_a_bag_that_can_be_verified(graph: Any, tmp_path: Path) -> None:
+    graph.start("plant", case=CASE)
+    graph.start("controller", case=CASE)
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    graph.wait_for_nodes("/plant", "/controller", "/recorder")
+    graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "25 end"])
+    graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > 500, 60, "some recording")
+    graph.wait_for_nodes("/recorder")
+    recorder.send(signal.SIGKILL)
+    account = verify(tmp_path / "bag")
+    assert account.different == 0 and account.equal + sum(account.unverifiable.values()) > 0
