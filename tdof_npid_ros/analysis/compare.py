@@ -64,7 +64,9 @@ class Comparison:
     @property
     def sound(self) -> bool:
         """Whether something was compared, and differs only where the parameters do."""
-        return not self.failure and self.equal + self.different > 0 and (not self.different or bool(self.other_parameters))
+        return (
+            not self.failure and self.equal + self.different > 0 and (not self.different or bool(self.other_parameters))
+        )
 
     def take(self, recorded: Recorded, key: Key, digest: str, effort: np.ndarray) -> None:
         """Compare one live answer, effort (lanes,)."""
@@ -97,7 +99,9 @@ class Comparison:
         """For people; nothing where nothing was compared."""
         lines = [self.failure] if self.failure else []
         if self.equal + self.different:
-            lines.append(f"{self.equal} control efforts equal bit for bit, {self.different} differ, by {self.largest:g} at most")
+            lines.append(
+                f"{self.equal} control efforts equal bit for bit, {self.different} differ, by {self.largest:g} at most"
+            )
         if self.first:
             lines.append(f"  first {self.first}")
         if self.other_parameters:

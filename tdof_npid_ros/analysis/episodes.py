@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
-from tdof_npid_ros.analysis.parameters import ParameterHistory, gains_by_digest
+from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations
 from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
@@ -36,6 +36,7 @@ class Episode:
         setpoint, output, control_effort: (samples, lanes); NaN where the bag does not hold them.
         disturbance: (samples,).
         gains: every set of controller parameters that answered, in order; empty where the bag does not hold them.
+        plainly_operated: whether the control law alone made the efforts: no manual mode, rate limit, filter, …
         plant: the parameters of the simulated plant; empty where the bag does not hold them.
         missing: outputs that the plan has and the bag has not.
     """
@@ -53,6 +54,7 @@ class Episode:
     output: np.ndarray
     control_effort: np.ndarray
     gains: tuple[Gains, ...]
+    plainly_operated: bool
     plant: Mapping[str, object]
     missing: int
 
@@ -88,7 +90,7 @@ def _episodes(loop: Loop) -> Iterator[Episode]:
     by_episode: dict[str, list[slice]] = defaultdict(list)
     for stretch in _stretches(answers) if answers is not None else []:
         by_episode[_episode_of(answers, stretch)].append(stretch)  # type: ignore[arg-type]
-    gains = {digest: gains for digest, (gains, _) in gains_by_digest(loop.histories).items()}
+    known = configurations(loop.histories)
     for count, stretch in enumerate(_stretches(loop.output), start=1):
         frame = str(loop.output.frame_id[stretch.start])
         planned = "/" in frame
@@ -96,7 +98,7 @@ def _episodes(loop: Loop) -> Iterator[Episode]:
             mine = by_episode[frame].pop(0) if by_episode[frame] else slice(0, 0)
         else:
             mine = _published_during(loop.output, stretch, answers)
-        episode = _episode(loop, stretch, frame if planned else "", count, answers, mine, gains, names)
+        episode = _episode(loop, stretch, frame if planned else "", count, answers, mine, known, names)
         if episode is not None:
             yield episode
 
@@ -137,7 +139,7 @@ def _episode(
     count: int,
     answers: Signal | None,
     mine: slice,
-    gains: Mapping[str, Gains],
+    known: Mapping[str, Configuration],
     names: Mapping[str, str],
 ) -> Episode | None:
     stamps, first = np.unique(loop.output.stamp_ns[stretch], return_index=True)
@@ -161,6 +163,7 @@ def _episode(
         setpoint = _on_grid(grid, effort_stamps, _widened(setpoint_rows, output), hold)
         changes = np.flatnonzero(answers.frame_id[mine][1:] != answers.frame_id[mine][:-1]) + 1
         digests = [str(answers.frame_id[mine][i]).partition(" ")[0] for i in (0, *changes)]
+    used = [known[name] for name in digests] if set(digests) <= known.keys() else []
     start_ns = int(loop.output.publish_ns[stretch.start])
     if plan is not None:
         signals = plan.sampled(period_ns)
@@ -168,7 +171,9 @@ def _episode(
         disturbance = signals.disturbance
     else:
         if np.isnan(setpoint).all() and loop.setpoint is not None:
-            setpoint = np.repeat(_live(loop.setpoint, "position", loop, stretch, grid)[:, None], output.shape[1], axis=1)
+            setpoint = np.repeat(
+                _live(loop.setpoint, "position", loop, stretch, grid)[:, None], output.shape[1], axis=1
+            )
         disturbance = _live(loop.disturbance, "effort", loop, stretch, grid)
     return Episode(
         bag=loop.bag,
@@ -183,7 +188,8 @@ def _episode(
         disturbance=disturbance,
         output=output,
         control_effort=effort,
-        gains=tuple(gains[name] for name in digests if name in gains) if set(digests) <= gains.keys() else (),
+        gains=tuple(configuration.gains for configuration in used),
+        plainly_operated=all(configuration.operation.is_plain for configuration in used),
         plant=loop.plant.at(start_ns) if loop.plant is not None else {},
         missing=int(np.isnan(output).any(axis=1).sum()),
     )

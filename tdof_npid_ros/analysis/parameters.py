@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains, gains_from_mapping
+from tdof_npid_ros.control.operation import Operation, operation_from_mapping
 
 TOPIC = "/parameter_events"
 # The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.
@@ -73,18 +74,27 @@ def read_histories(reader: BagReader) -> dict[str, ParameterHistory]:
     return {node: ParameterHistory(node, tuple(changes)) for node, changes in events.items()}
 
 
-def gains_by_digest(histories: Mapping[str, ParameterHistory]) -> dict[str, tuple[Gains, int]]:
-    """Every set of controller parameters that a node had: gains and sample period in ns, by its digest."""
-    found: dict[str, tuple[Gains, int]] = {}
+class Configuration(NamedTuple):
+    """All that a controller's answers are computed with."""
+
+    gains: Gains
+    operation: Operation
+    sample_period_ns: int
+
+
+def configurations(histories: Mapping[str, ParameterHistory]) -> dict[str, Configuration]:
+    """Every set of controller parameters that a node had, by its digest."""
+    found: dict[str, Configuration] = {}
     for history in histories.values():
         for _, values in history.sets():
             if "anti_windup" not in values or "sample_period" not in values:
                 continue
             try:
-                gains, period_ns = gains_from_mapping(values), sample_period_in_ns(values["sample_period"])
+                gains, operation = gains_from_mapping(values), operation_from_mapping(values)
+                period_ns = sample_period_in_ns(values["sample_period"])
             except ValueError:
                 continue  # the node declares its parameters one by one: not all of them yet
-            found[parameters_digest(gains, period_ns)] = gains, period_ns
+            found[parameters_digest(gains, period_ns, operation)] = Configuration(gains, operation, period_ns)
     return found
 
 

@@ -53,9 +53,13 @@ def draw(episodes: Sequence[Named], path: Path) -> None:
                 setpoint = episode.setpoint[:, lane]
                 if setpoint.tobytes() not in drawn:
                     drawn.add(setpoint.tobytes())
-                    above.plot(episode.time, setpoint, "--", color="0.4", lw=1, label="setpoint", drawstyle="steps-post")
+                    above.plot(
+                        episode.time, setpoint, "--", color="0.4", lw=1, label="setpoint", drawstyle="steps-post"
+                    )
                 style = {"color": _COLOURS[colour % len(_COLOURS)], "lw": 1.3}
-                above.plot(episode.time, episode.output[:, lane], label=label(name, episode, lane, several_bags), **style)
+                above.plot(
+                    episode.time, episode.output[:, lane], label=label(name, episode, lane, several_bags), **style
+                )
                 below.plot(episode.time, episode.control_effort[:, lane], drawstyle="steps-post", **style)
                 colour += 1
         above.set_title(group)

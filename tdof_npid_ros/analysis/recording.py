@@ -17,7 +17,7 @@ from tdof_npid_ros.scenario import Plan, PlanError
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 _OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
-_FIELDS = ("header.stamp", "header.frame_id", "position", "effort")
+_FIELDS = ("header.stamp", "header.frame_id", "name", "position", "velocity", "effort")
 _SECOND = 1_000_000_000  # ns
 
 
@@ -30,14 +30,17 @@ class Signal:
         frame_id: of the headers, (messages,).
         publish_ns: when they were published, ns since the epoch, (messages,).
         sequence: the publisher's count of its messages, (messages,); 0 where the bag does not tell.
-        position, effort: (messages, lanes), or (messages,) of arrays where the number of lanes changes.
+        position, velocity, effort: (messages, lanes), or (messages,) of arrays where the number of lanes changes.
+        name: likewise, of strings.
     """
 
     stamp_ns: np.ndarray
     frame_id: np.ndarray
     publish_ns: np.ndarray
     sequence: np.ndarray
+    name: np.ndarray
     position: np.ndarray
+    velocity: np.ndarray
     effort: np.ndarray
 
     def __len__(self) -> int:
@@ -145,7 +148,9 @@ def _signal(reader: BagReader, topic: str) -> Signal:
         columns["header.frame_id"],
         columns["publish_time"],
         columns[SEQUENCE],
+        columns["name"],
         columns["position"],
+        columns["velocity"],
         columns["effort"],
     )
 

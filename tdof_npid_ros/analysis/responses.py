@@ -108,9 +108,7 @@ def deviation(episode: Episode) -> Deviation:
     case = Case("", episode.sample_period_ns, str(plant["model"]), plant, _limits(episode), episode.gains[0], {})
     signals = episode.plan.sampled(episode.sample_period_ns)
     wanted = simulate(case.plant_at, episode.gains[0], signals, case.effort_limits)
-    return Deviation(
-        _largest(wanted.output, episode.output), _largest(wanted.control_effort, episode.control_effort)
-    )
+    return Deviation(_largest(wanted.output, episode.output), _largest(wanted.control_effort, episode.control_effort))
 
 
 def _largest(wanted: np.ndarray, recorded: np.ndarray) -> float:
@@ -127,6 +125,8 @@ def _not_simulated(episode: Episode) -> str | None:
         return "the controller's parameters are not in the bag"
     if len(set(episode.gains)) > 1:
         return "the gains change during the episode"
+    if not episode.plainly_operated:
+        return "the controller is operated: manual mode, rate limits, filters"
     if episode.gains[0].lanes != episode.lanes:
         return f"the gains are for {episode.gains[0].lanes} lanes, the outputs for {episode.lanes}"
     return None
@@ -160,9 +160,7 @@ def _changes(episode: Episode, lane: int) -> list[tuple[int, Kind, float]]:
     return [(k, kinds[k], float(before[k])) for k in sorted(kinds) if k < len(r) - 1]
 
 
-def _measured(
-    episode: Episode, lane: int, kind: Kind, first: int, last: int, before: float, step: float
-) -> Response:
+def _measured(episode: Episode, lane: int, kind: Kind, first: int, last: int, before: float, step: float) -> Response:
     period = episode.sample_period_ns / 1e9
     window = slice(first, last + 1)
     y, r = episode.output[window, lane], episode.setpoint[window, lane]

@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
-from tdof_npid_ros.analysis.parameters import gains_by_digest
+from tdof_npid_ros.analysis.parameters import Configuration, configurations
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.control.stamps import Stamps
-from tdof_npid_ros.scenario import Plan, Signals
+from tdof_npid_ros.control.stamps import Stamps, Verdict, begins_from_nothing
+from tdof_npid_ros.scenario import Plan
 
 # Why an answer cannot be verified.
 NO_PARAMETERS = "the parameters that they bear the digest of are not in the bag"
@@ -54,7 +53,9 @@ class Difference:
 
     def lines(self) -> list[str]:
         """The difference for people, numbers in full."""
-        place = f"{self.topic}, message {self.step}, at {self.stamp_ns / 1e9:.9g} s of {self.episode or 'the recording'}"
+        place = (
+            f"{self.topic}, message {self.step}, at {self.stamp_ns / 1e9:.9g} s of {self.episode or 'the recording'}"
+        )
         return [
             f"first difference: {self.what} in {place}",
             *(f"  {name:22} {value}" for name, value in self.inputs.items()),
@@ -118,7 +119,7 @@ class _Answer(NamedTuple):
     digest: str
     episode: str
     output: int
-    known_start: bool  # the publisher had published nothing before
+    new_publisher: bool  # the controller was activated before this answer
     follows: bool  # no answer is missing between this one and the one before
 
 
@@ -131,20 +132,27 @@ class _Replay:
         self._answers = loop.control_effort
         self._account = account
         self._topic = f"{loop.namespace}control_effort"
-        self._gains = gains_by_digest(loop.histories)
-        self._signals: dict[tuple[str, int], Signals] = {}
+        self._configurations = configurations(loop.histories)
         self._controller: Controller | None = None
         self._stamps = Stamps()
         self._known = False  # whether the controller's state is that of the recorded one
-        self._first_difference: Difference | None = None
 
     def run(self) -> None:
         """Take every answer of the loop, in order."""
-        positions = self._loop.output.position
         setpoints, efforts = self._answers.position, self._answers.effort
         for answer in _answers(self._loop):
-            y = positions[answer.output] if answer.output >= 0 else None
-            self._take(answer, y, setpoints[answer.step], efforts[answer.step])
+            self._take(answer, self._output(answer), setpoints[answer.step], efforts[answer.step])
+
+    def _output(self, answer: _Answer) -> np.ndarray | None:
+        return None if answer.output < 0 else self._picked(answer, self._loop.output.position[answer.output])
+
+    def _picked(self, answer: _Answer, field: np.ndarray) -> np.ndarray:
+        """The lanes' values in a field of an output, by the joints that the answer names."""
+        wanted, names = self._answers.name[answer.step], self._loop.output.name[answer.output]
+        if not len(wanted) or not set(wanted) <= set(names) or len(field) != len(names):
+            return field
+        there = list(names)
+        return np.array([field[there.index(name)] for name in wanted])
 
     def _take(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray, u: np.ndarray) -> None:
         reason = self._prepare(answer, y, r)
@@ -165,30 +173,53 @@ class _Replay:
 
     def _prepare(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray) -> str | None:
         """Bring the controller to where the recorded one was before this answer, or say why that cannot be."""
-        configuration = self._gains.get(answer.digest)
+        if answer.new_publisher:
+            self._stamps.forget()
         verdict = self._stamps.take(answer.stamp_ns, answer.episode)
-        fresh = answer.known_start or answer.stamp_ns == 0 or (verdict == "restart" and answer.step > 0)
-        if answer.known_start or not answer.follows:
+        if verdict == "late":  # it was answered: after late ones, which were not, the clock counts as set back
+            self._stamps.forget()
+            verdict = self._stamps.take(answer.stamp_ns, answer.episode)
+        self._known = self._known and answer.follows
+        configuration = self._configurations.get(answer.digest)
+        reason = self._obstacle(configuration, y, r)
+        if reason is not None:
             self._known = False
-        if configuration is None or y is None:
-            self._known = False
-            return NO_PARAMETERS if configuration is None else NO_OUTPUT
-        gains, period_ns = configuration
-        if len(y) != gains.lanes or len(r) != gains.lanes:
-            self._known = False
-            return OTHER_LANES
-        self._configure(answer.digest, gains, period_ns)
-        if verdict == "restart" or answer.known_start:
-            assert self._controller is not None
-            self._controller.reset()
-        self._known = self._known or fresh
+            return reason
+        assert configuration is not None
+        self._configure(configuration)
+        self._begin(answer, verdict)
         return None
 
-    def _configure(self, digest: str, gains: Gains, period_ns: int) -> None:
+    @staticmethod
+    def _obstacle(configuration: Configuration | None, y: np.ndarray | None, r: np.ndarray) -> str | None:
+        if configuration is None:
+            return NO_PARAMETERS
+        if y is None:
+            return NO_OUTPUT
+        lanes = configuration.gains.lanes
+        return OTHER_LANES if len(y) != lanes or len(r) != lanes else None
+
+    def _configure(self, configuration: Configuration) -> None:
+        gains, operation, period_ns = configuration
         if self._controller is None or self._controller.sample_period_ns != period_ns:
-            self._controller = Controller(gains, period_ns)
-        elif self._controller.digest != digest:
-            self._controller.change_gains(gains)
+            self._controller = Controller(gains, period_ns, operation)
+        elif (self._controller.gains, self._controller.operation) != (gains, operation):
+            self._controller.change(gains, operation)
+
+    def _begin(self, answer: _Answer, verdict: Verdict) -> None:
+        """As the controller node does: from nothing, or within a running loop with the integral action it tells."""
+        assert self._controller is not None
+        integral = self._answers.velocity[answer.step]
+        if verdict != "same" and len(integral) == self._controller.lanes:
+            applied = self._picked(answer, self._loop.output.effort[answer.output])
+            if len(applied) != self._controller.lanes or not np.isfinite(applied).all():
+                applied = self._controller.effort
+            self._controller.begin_within(applied.copy(), integral)
+            self._known = True
+        elif verdict == "restart":
+            self._controller.reset()
+            from_nothing = begins_from_nothing(answer.stamp_ns, answer.episode)
+            self._known = from_nothing or answer.new_publisher or (answer.step > 0 and answer.follows)
 
     def _planned(self, answer: _Answer, lanes: int) -> np.ndarray | None:
         """The plan's setpoint, (lanes,); None where there is no plan."""
@@ -205,7 +236,7 @@ class _Replay:
             return
         assert self._controller is not None
         inputs: dict[str, Any] = {"setpoint": _numbers(r), "output": _numbers(y), "parameters": answer.digest}
-        inputs |= self._controller.gains.as_dict()
+        inputs |= self._controller.gains.as_dict() | self._controller.operation.as_dict()
         inputs |= {term: _numbers(row) for term, row in zip(TERMS, self._controller.terms, strict=True)}
         self._account.first = Difference(
             what,
@@ -226,7 +257,8 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
     outputs = loop.output
     places: dict[tuple[str, int], list[int]] = defaultdict(list)  # of the outputs, latest first
     for i in range(len(outputs) - 1, -1, -1):
-        places[str(outputs.frame_id[i]), int(outputs.stamp_ns[i])].append(i)
+        frame = str(outputs.frame_id[i])  # of a robot it is not the name of an episode
+        places[frame if "/" in frame else "", int(outputs.stamp_ns[i])].append(i)
     latest = before = 0
     for step, (frame, stamp, sequence) in enumerate(
         zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)

@@ -123,7 +123,7 @@ class LoopPool:
             usable = [loop.client for loop in self._loops.values() if not loop.why_out]
             if usable and (time.monotonic() > self._gathered or self._knows_all()):
                 return usable
-            if time.monotonic() > end or (self._loops and all(loop.refused for loop in self._loops.values())):
+            if time.monotonic() > end or self._knows_all():
                 raise TuningError(f"no loop to tune: {self._why_none()}")
             time.sleep(POLL)
 

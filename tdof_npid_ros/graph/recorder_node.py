@@ -151,9 +151,7 @@ class RecorderNode(LoopNode):
             return  # only subscribed so far
         tap = self.taps.get(topic)
         wanted = _as_reliable_as(offered)
-        if tap is not None and any(
-            qos_check_compatible(qos, tap.qos)[0] == QoSCompatibility.ERROR for qos in offered
-        ):
+        if tap is not None and any(qos_check_compatible(qos, tap.qos)[0] == QoSCompatibility.ERROR for qos in offered):
             self.get_logger().warning(f"{topic}: a publisher offers less than the others: subscribing again")
             with self.lock:
                 self.taps.pop(topic).close()
@@ -272,9 +270,7 @@ def _profile(qos: QoSProfile) -> QosProfile:
 
 def _expected_qos(name: str) -> QoSProfile:
     durability = DurabilityPolicy.TRANSIENT_LOCAL if name == "scenario_plan" else DurabilityPolicy.VOLATILE
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=durability
-    )
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
 def _as_reliable_as(offered: list[QoSProfile]) -> QoSProfile:

@@ -47,8 +47,12 @@ class ReplayNode(LoopNode):
         self.rate = number("rate", declare("rate", 1.0, "times the recorded speed, above 0", fixed=True), low=1e-6)
         self.start = number("start", declare("start", 0.0, "s of the recording to leave out", fixed=True), low=0.0)
         self.loop = bool(declare("loop", False, "begin again at the end", fixed=True))
-        self.clock = bool(declare("clock", False, "publish /clock, as recorded, else the time of recording", fixed=True))
-        self.compare = bool(declare("compare", False, "compare a live controller's efforts with the recorded", fixed=True))
+        self.clock = bool(
+            declare("clock", False, "publish /clock, as recorded, else the time of recording", fixed=True)
+        )
+        self.compare = bool(
+            declare("compare", False, "compare a live controller's efforts with the recorded", fixed=True)
+        )
         self.accept_changes()
         try:
             self.reader = BagReader(self.bag)
@@ -78,7 +82,9 @@ class ReplayNode(LoopNode):
     # What is published
 
     def _topics(self) -> list[str]:
-        wanted = [topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic]
+        wanted = [
+            topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic
+        ]
         if self.compare:
             wanted = [topic for topic in wanted if self._relative(topic) in FOR_CONTROLLER]
         return wanted
@@ -161,7 +167,9 @@ class ReplayNode(LoopNode):
             with self.answered:
                 if self.answered.wait_for(lambda: self.answer == expected or self.stopping.is_set(), REPLY_TIMEOUT):
                     return
-        raise TimeoutError(f"no answer to the output at {expected[1] / SECOND:g} s: start a controller in this namespace")
+        raise TimeoutError(
+            f"no answer to the output at {expected[1] / SECOND:g} s: start a controller in this namespace"
+        )
 
     def _on_answer(self, message: JointState) -> None:
         assert self.recorded is not None

@@ -13,6 +13,7 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.operation import PLAIN
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -22,8 +23,14 @@ START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000  # between two messages in the bag
 
 
-def joint_state(stamp_ns: int, frame_id: str, position: Sequence[float] = (), effort: Sequence[float] = ()) -> bytes:
-    arrays = [np.array(values, np.float64) for values in (position, (), effort)]
+def joint_state(
+    stamp_ns: int,
+    frame_id: str,
+    position: Sequence[float] = (),
+    effort: Sequence[float] = (),
+    velocity: Sequence[float] = (),
+) -> bytes:
+    arrays = [np.array(values, np.float64) for values in (position, velocity, effort)]
     return _cdr(JOINT_STATE, TYPES.types[JOINT_STATE](_header(stamp_ns, frame_id), [], *arrays))
 
 
@@ -90,7 +97,7 @@ class LoopBag:
         plant = {**case.plant_values, "model": case.model, "lanes": gains.lanes}
         plant |= {"effort_min": case.effort_limits[0], "effort_max": case.effort_limits[1]}
         self.parameters("plant", {**plant, **period, "mode": "lockstep"})
-        self.parameters("controller", {**gains.as_dict(), **period})
+        self.parameters("controller", {**gains.as_dict(), **PLAIN.as_dict(), **period})
         plans = {f"plan.{name}": list(lines) for name, lines in case.episodes.items()}
         self.parameters("scenario", {"episodes": list(case.episodes), **plans, **period})
 

@@ -74,7 +74,7 @@ def test_each_change_in_a_plan_is_a_response_of_its_own(tmp_path, case) -> None:
     with LoopBag(tmp_path / "bag") as writer:
         writer.configuration(long, case.gains)
         writer.episode(long, case.gains, "mixed", 1)
-    (first, second, third), = analyze([tmp_path / "bag"]).episodes[0].responses
+    ((first, second, third),) = analyze([tmp_path / "bag"]).episodes[0].responses
     assert [(r.kind, r.start_s, r.end_s) for r in (first, second, third)] == [
         ("setpoint", 0.0, 5.0), ("disturbance", 5.0, 10.0), ("setpoint", 10.0, 20.0)
     ]  # fmt: skip
@@ -84,7 +84,9 @@ def test_each_change_in_a_plan_is_a_response_of_its_own(tmp_path, case) -> None:
 
 
 def test_a_change_of_the_plant(tmp_path) -> None:
-    sprott = replace(load_case("sprott"), episodes={"increase": ("0 setpoint 1", "0 plant.a 0.6", "1 plant.a 0.72", "2 end")})
+    sprott = replace(
+        load_case("sprott"), episodes={"increase": ("0 setpoint 1", "0 plant.a 0.6", "1 plant.a 0.72", "2 end")}
+    )
     with LoopBag(tmp_path / "bag") as writer:
         writer.configuration(sprott, sprott.gains)
         writer.episode(sprott, sprott.gains, "increase", 1)

@@ -11,11 +11,15 @@ from tdof_npid_ros.analysis.verify import NO_PARAMETERS, UNKNOWN_STATE
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.operation import PLAIN
 
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    return replace(load_case("p1-c0.5"), episodes={"setpoint": ("0 setpoint 1", "2 end"), "disturbance": ("0 disturbance 1", "2 end")})
+    return replace(
+        load_case("p1-c0.5"),
+        episodes={"setpoint": ("0 setpoint 1", "2 end"), "disturbance": ("0 disturbance 1", "2 end")},
+    )
 
 
 def write(folder, case, gains=None, **options) -> None:
@@ -143,3 +147,23 @@ def test_a_bag_without_efforts_is_refused(tmp_path) -> None:
         verify.verify(tmp_path / "bag")
 
 
+def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_action(tmp_path, case) -> None:
+    """A robot's loop, manual mode and a rate limit in between; joints by name."""
+    operation = PLAIN
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(300):
+            stamp, y = 10**10 + k * case.sample_period_ns, np.array([np.sin(k / 30)])
+            if k == 0:
+                controller.begin_within(np.array([0.3]))
+            if k in (100, 150):
+                operation = replace(operation, manual=k == 100, manual_effort=0.7, effort_rate=5.0)
+                bag.parameters("controller", {"manual": k == 100, "manual_effort": 0.7, "effort_rate": 5.0})
+                controller.change(case.gains, operation)
+            controller.answer(stamp, np.ones(1), y)
+            begun = controller.integral_before if k == 0 else ()
+            bag.write("output", JOINT_STATE, joint_state(stamp, "base_link", y, [0.3]))
+            answer = joint_state(stamp, controller.digest, [1.0], controller.effort, begun)
+            bag.write("control_effort", JOINT_STATE, answer)
+    assert verify.verify(tmp_path / "bag").equal == 300

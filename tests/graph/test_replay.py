@@ -37,7 +37,7 @@ def test_every_message_is_published_again_in_order(graph: Any, bag: Path) -> Non
     from sensor_msgs.msg import JointState
 
     outputs = graph.collect("output", JointState)
-    replay = graph.start("replay", bag=str(bag), rate=0.05)
+    replay = graph.start("replay", bag=str(bag), rate=0.01)
     graph.wait_until(lambda: len(outputs) > 10, 60, "outputs")
     wait_for_end(graph, replay, 0)
     graph.wait_until(lambda: outputs[-1].header.stamp.sec == 1, what="the last output")
