@@ -20,7 +20,7 @@ UNLIMITED = (-math.inf, math.inf)
 class Pendulum:
     """A user's plant: a damped pendulum with a torque at its pivot."""
 
-    parameters = {"damping": 0.1, "stiffness": 9.81}
+    parameters = {"damping": 0.1, "stiffness": 9.81}  # noqa: RUF012 (as a user writes it)
     initial_state = (0.5, 0.0)
 
     @staticmethod

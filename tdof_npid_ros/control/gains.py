@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -102,7 +103,7 @@ class Gains:
                 f"kp={self.kp}, ki={self.ki}, kd={self.kd} differ in sign: all >= 0 (direct) or all <= 0 (reverse action)"
             )
 
-    @property
+    @cached_property
     def lanes(self) -> int:
         """Number of lanes that the gains are for; 1 if every gain is a single number."""
         return max(len(_as_tuple(getattr(self, name))) for name in PER_LANE)

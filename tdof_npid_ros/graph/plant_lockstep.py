@@ -17,7 +17,7 @@ from tdof_npid_ros.scenario import Plan
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
 
-CLOCK_PERIOD = 0.02  # s of wall time between two /clock messages
+CLOCK_PERIOD = 0.05  # s of wall time between two /clock messages
 
 
 class LockstepPlant:

@@ -66,8 +66,6 @@ def write_bag(
             data = joint_state(step * 1000, "a1b2c3/0", position=[np.sin(step)], effort=[np.cos(step)])
             if each is not None:
                 each(writer, step)
-            writer.write(
-                topics[topic], data, START_NS + step * 1000, START_NS + step * 1000 - 7, step // 2 + 1
-            )
+            writer.write(topics[topic], data, START_NS + step * 1000, START_NS + step * 1000 - 7, step // 2 + 1)
             written.append((topic, START_NS + step * 1000, START_NS + step * 1000 - 7, data))
     return written

@@ -154,9 +154,7 @@ text = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 @given(
     st.lists(
-        st.tuples(
-            st.integers(0, 2**31 * 10**9 - 1), text, st.lists(text, max_size=3), floats, floats, floats
-        ),
+        st.tuples(st.integers(0, 2**31 * 10**9 - 1), text, st.lists(text, max_size=3), floats, floats, floats),
         min_size=1,
         max_size=30,
     ),

@@ -85,11 +85,7 @@ def test_truncated_anywhere(tmp_path, compression) -> None:
     counts = [piece.load().length.size for piece in file.pieces()]
     file.close()
     chance = random.Random(2)
-    cuts = (
-        range(len(whole))
-        if len(whole) <= TRUNCATIONS // 3
-        else chance.sample(range(len(whole)), TRUNCATIONS // 3)
-    )
+    cuts = range(len(whole)) if len(whole) <= TRUNCATIONS // 3 else chance.sample(range(len(whole)), TRUNCATIONS // 3)
     path = tmp_path / "cut.mcap"
     for cut in cuts:
         path.write_bytes(whole[:cut])

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import zstandard
@@ -109,9 +110,7 @@ def test_mutated_bags_raise_nothing_but_bag_errors(tmp_path) -> None:
             with contextlib.suppress(BagError):
                 recover(path, tmp_path / f"recovered_{number}")
         slowest = max(slowest, time.monotonic() - begin)
-    print(
-        f"{MUTATIONS} mutated MCAP files: {refused} refused, no other error; the slowest took {slowest:.2f} s"
-    )
+    print(f"{MUTATIONS} mutated MCAP files: {refused} refused, no other error; the slowest took {slowest:.2f} s")
 
 
 def test_bits_flipped_in_a_finished_bag_never_go_unnoticed(tmp_path) -> None:
@@ -182,9 +181,7 @@ def test_any_bytes_as_a_file(tmp_path_factory, data) -> None:
 
 
 @given(
-    st.sampled_from(
-        [JOINT_STATE, "trajectory_msgs/msg/JointTrajectory", "rcl_interfaces/msg/ParameterEvent"]
-    ),
+    st.sampled_from([JOINT_STATE, "trajectory_msgs/msg/JointTrajectory", "rcl_interfaces/msg/ParameterEvent"]),
     st.sampled_from([b"\0\1\0\0", b"\0\0\0\0", b""]),
     st.binary(max_size=300),
 )
@@ -315,7 +312,7 @@ def test_chunk_bombs_take_bounded_memory(tmp_path) -> None:
         [sys.executable, "-c", BOMB, str(tmp_path)],
         capture_output=True,
         text=True,
-        cwd=sys.path[0],
+        cwd=Path(__file__).parents[2],
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -35,10 +35,7 @@ def test_rosbags_reads_ours(tmp_path, compression) -> None:
 def test_any_reader_decodes_ours(tmp_path) -> None:
     write_bag(tmp_path / "bag", 100)
     with AnyReader([tmp_path / "bag"]) as reader:
-        efforts = [
-            reader.deserialize(data, connection.msgtype).effort[0]
-            for connection, _, data in reader.messages()
-        ]
+        efforts = [reader.deserialize(data, connection.msgtype).effort[0] for connection, _, data in reader.messages()]
     assert_array_equal(efforts, np.cos(np.arange(100)))
 
 
@@ -50,9 +47,7 @@ def test_mcap_and_its_ros2_decoder_read_ours(tmp_path, compression) -> None:
         summary = reader.get_summary()
         assert summary.statistics.message_count == 3000
         assert reader.get_header().profile == "ros2"
-        for (topic, log_time, publish_time, data), found in zip(
-            written, reader.iter_decoded_messages(), strict=True
-        ):
+        for (topic, log_time, publish_time, data), found in zip(written, reader.iter_decoded_messages(), strict=True):
             assert (found.channel.topic, found.message.log_time) == (topic, log_time)
             assert (found.message.publish_time, found.message.data) == (publish_time, data)
             assert found.decoded_message.header.frame_id == "a1b2c3/0"
@@ -69,10 +64,7 @@ def test_we_read_bags_of_rosbags(tmp_path, plugin, storage_compression) -> None:
     if storage_compression:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
-        topics = [
-            writer.add_connection(name, JOINT_STATE, typestore=TYPES)
-            for name in ("/output", "/control_effort")
-        ]
+        topics = [writer.add_connection(name, JOINT_STATE, typestore=TYPES) for name in ("/output", "/control_effort")]
         for step in range(20_000):
             writer.write(topics[step % 2], START_NS + step, joint_state(step, "frame", position=[step]))
     with BagReader(tmp_path / "bag") as reader:

@@ -58,14 +58,10 @@ def test_splits_by_duration(tmp_path) -> None:
 
 def test_metadata_yaml_and_custom_data(tmp_path) -> None:
     with BagWriter(tmp_path / "bag", custom_data={"case": "p1-c4"}) as writer:
-        topic = writer.add_topic(
-            "/output", JOINT_STATE, qos=[QosProfile(durability="transient_local", depth=3)]
-        )
+        topic = writer.add_topic("/output", JOINT_STATE, qos=[QosProfile(durability="transient_local", depth=3)])
         writer.write(topic, joint_state(), START_NS, START_NS)
         writer.custom_data["steps"] = "1"
-    information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())[
-        "rosbag2_bagfile_information"
-    ]
+    information = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert information["version"] == 9
     assert information["custom_data"] == {"case": "p1-c4", "steps": "1"}
     with Reader(tmp_path / "bag") as theirs:

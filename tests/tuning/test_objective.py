@@ -42,7 +42,9 @@ def test_a_lane_that_diverged_later_costs_less_and_any_sound_lane_costs_less_sti
 
 
 def test_the_order_of_useless_but_finite_errors_is_kept() -> None:
-    iaes = np.sort(np.concatenate([10.0 ** np.arange(-300.0, 300.0, 3.7), LARGEST_IAE * np.array([0.9999, 1.0, 1.0001])]))
+    iaes = np.sort(
+        np.concatenate([10.0 ** np.arange(-300.0, 300.0, 3.7), LARGEST_IAE * np.array([0.9999, 1.0, 1.0001])])
+    )
     values = objective_values(Integrals(iaes, np.ones_like(iaes)), Integrals(0 * iaes, np.ones_like(iaes)), weight=1.0)
     assert np.all(np.diff(values) > 0)
     assert np.array_equal(values[iaes <= LARGEST_IAE], iaes[iaes <= LARGEST_IAE])

@@ -41,7 +41,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 def test_it_prints_what_simulate_prints_for_the_optimum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tuned(capsys, "--controller", "tdof_npid1", "--out", str(tmp_path / "gains.yaml"))
-    assert main(["simulate", "p3-c1", "--controller", "tdof_npid1", "--gains", str(tmp_path / "gains.yaml"), "--json"]) == 0
+    assert (
+        main(["simulate", "p3-c1", "--controller", "tdof_npid1", "--gains", str(tmp_path / "gains.yaml"), "--json"])
+        == 0
+    )
     simulated = json.loads(capsys.readouterr().out)
     assert report.pop("evaluations") == 50
     assert report.pop("elapsed_s") > 0
@@ -123,9 +126,7 @@ def test_people_see_the_progress_and_the_optimum(capsys: pytest.CaptureFixture[s
         (["p3-c1", "--controller", "pid", "--out", str(config_folder() / "p3-c1.yaml")], "must be different files"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(
-    arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_refused_in_one_line(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert told in refused(capsys, *arguments)
 
 
