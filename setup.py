@@ -1,7 +1,7 @@
 """Packaging, for colcon (ament_python) and for pip."""
 
 import sys
-from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -17,10 +17,22 @@ ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 PAPER = ["pymoo>=0.6,<0.7", "cma>=4,<5"]
 BENCH = ["control==0.10.2", "simple-pid==2.0.1", "optuna==5.0.0", "pymoo==0.6.2", "cma==4.5.0"]
 TEST = [
-    "pytest>=8", "pytest-timeout", "hypothesis", "ruff", "mypy", "types-PyYAML", "scipy-stubs",
-    "rosbags", "mcap-ros2-support",
-    "colcon-core", "colcon-ros", "colcon-package-selection", "colcon-bash", "colcon-recursive-crawl", "setuptools<80",
-]  # fmt: skip
+    "pytest>=8",
+    "pytest-timeout",
+    "hypothesis",
+    "ruff",
+    "mypy",
+    "types-PyYAML",
+    "scipy-stubs",
+    "rosbags",
+    "mcap-ros2-support",
+    "colcon-core",
+    "colcon-ros",
+    "colcon-package-selection",
+    "colcon-bash",
+    "colcon-recursive-crawl",
+    "setuptools<80",
+]
 
 setup(
     name=NAME,
@@ -34,14 +46,22 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/config", glob("config/*.*")),
-        (f"share/{NAME}/launch", glob("launch/*.launch.py")),
+        (f"share/{NAME}/config", [str(path) for path in Path("config").glob("*.*")]),
+        (f"share/{NAME}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
     ],
     python_requires=">=3.10",
     install_requires=[
-        "numpy>=1.26", "scipy>=1.11", "numba>=0.59", "mpmath>=1.3", "PyYAML>=6", "mcap>=1.1", "zstandard>=0.22",
-        "lz4>=4", "matplotlib>=3.6", "tqdm>=4.60",
-    ],  # fmt: skip
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "numba>=0.59",
+        "mpmath>=1.3",
+        "PyYAML>=6",
+        "mcap>=1.1",
+        "zstandard>=0.22",
+        "lz4>=4",
+        "matplotlib>=3.6",
+        "tqdm>=4.60",
+    ],
     extras_require={"ros": ROS, "paper": PAPER, "test": [*TEST, *PAPER], "bench": BENCH},
     entry_points={"console_scripts": [f"tdof-npid = {NAME}.cli:entry", *node_scripts]},
     zip_safe=False,

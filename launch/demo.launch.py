@@ -1,10 +1,11 @@
 """The closed loop of a case on an installed ROS 2: `ros2 launch tdof_npid_ros demo.launch.py case:=p1-c0.5`."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 NODES = ("recorder", "plant", "controller", "scenario")
 

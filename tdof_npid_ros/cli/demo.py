@@ -7,19 +7,24 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from tdof_npid_ros.case import Case, find_parameter_file, load_case
+from tdof_npid_ros.case import Case, controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli.gains import gains_by_source
-from tdof_npid_ros.control.gains import PER_LANE
+from tdof_npid_ros.control.gains import PER_LANE, Gains
 from tdof_npid_ros.paper.tables import COMPARED, published
 
 CASE = "p1-c0.5"
 NAMESPACE = "/demo"
+TUNED_TYPE = "tdof_npid2"
+GENERATIONS = 5  # of 40 candidates: a short tuning
 START_TIMEOUT = 60.0  # s; the first start compiles
 PLAY_TIMEOUT = 120.0  # s
 SUBSCRIBERS = {"output": 2, "control_effort": 2, "controller_state": 1, "scenario_plan": 3}
@@ -31,81 +36,114 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo."""
+    """Tune over ROS 2, then run the published and the tuned gains, recorded, and compare."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     from tdof_npid_ros.analysis.report import analyze
-    from tdof_npid_ros.graph.conductor import Conductor
-    from tdof_npid_ros.graph.processes import NodeProcesses
 
     case = load_case(CASE)
     bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
     if bag.exists():
         raise FileExistsError(f"{bag} exists already and is not overwritten: choose another --bag")
-    with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as nodes:
-        nodes.start("recorder", {"bag": bag, "lossless": True})
-        for node in ("plant", "controller"):
-            nodes.start(node, {"lossless": True})
-        nodes.start("scenario", {"play": False})
-        conductor = Conductor(NAMESPACE, nodes.check)
-        try:
-            _say(arguments, f"Starting plant, controller, scenario and recorder in {NAMESPACE} …")
-            conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
-            _play(conductor, case, quiet=arguments.json)
-        finally:
-            conductor.close()
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder) / "tuned.yaml"
+        _tune(result, quiet=arguments.json)
+        tuned = gains_by_source(case, TUNED_TYPE, str(result))
+        rounds = {name: gains_by_source(case, name, "published") for name in COMPARED} | {f"{TUNED_TYPE}, tuned": tuned}
+        _record(case, rounds, bag, quiet=arguments.json)
+        shutil.copy(result, bag / "tuned.yaml")
     report = analyze([bag])
     picture = bag / "responses.png"
     report.picture(picture)
     if arguments.json:
         print(json.dumps({"bag": str(bag), "picture": str(picture), "episodes": report.as_json()["episodes"]}))
     else:
-        print(_comparison(report))
-        print(f"bag      {bag}\npicture  {picture}")
+        print(_comparison(report, list(rounds), len(case.plans)))
         program = "tdof-npid" if shutil.which("tdof-npid") else sys.argv[0]
+        print(f"bag      {bag}\npicture  {picture}\ntuned    {bag / 'tuned.yaml'}")
         print(f"next     {program} verify {bag}")
         print(f"         {program} analyze {bag} --html report.html")
     return 0
 
 
-def _say(arguments: argparse.Namespace, text: str) -> None:
-    if not arguments.json:
-        print(text, flush=True)
+@contextmanager
+def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[Any]:
+    """The nodes, by name with their parameters, as processes, and a conductor for them; all of it ends with the context."""
+    from tdof_npid_ros.graph.conductor import Conductor
+    from tdof_npid_ros.graph.processes import NodeProcesses
+
+    with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as processes:
+        for name, parameters in nodes.items():
+            processes.start(name, parameters)
+        conductor = Conductor(NAMESPACE, processes.check)
+        try:
+            yield conductor
+        finally:
+            conductor.close()
 
 
-def _play(conductor: Any, case: Case, quiet: bool) -> None:
-    """Play the case's episodes once for each compared controller, with a progress bar in simulated seconds."""
-    episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
-    with tqdm(total=len(COMPARED) * sum(episode_s), unit=" s", disable=quiet, bar_format=_BAR) as bar:
-        for round_, controller in enumerate(COMPARED):
-            gains = gains_by_source(case, controller, "published")
-            bar.set_description(f"{controller:10}")
-            conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
-            conductor.trigger("scenario/play")
+def _tune(result: Path, quiet: bool) -> None:
+    """A short run of the tuner node on a loop of its own."""
+    tuner = {"case": CASE, "type": TUNED_TYPE, "generations": GENERATIONS, "result": result, "stay": True}
+    if not quiet:
+        print(f"Tuning {TUNED_TYPE} through a loop of plant, controller and tuner in {NAMESPACE} …", flush=True)
+    with _loop({"plant": {}, "controller": {}, "tuner": tuner}) as conductor:
+        with tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR) as bar:
 
-            def played(round_: int = round_) -> bool:
-                done = int(conductor.fact("plant", "episode") or 0) - 1 - round_ * len(episode_s)
-                if 0 <= done < len(episode_s):
-                    position = round_ * sum(episode_s) + sum(episode_s[:done]) + conductor.time_ns / 1e9
-                    bar.update(max(0.0, min(position, bar.total) - bar.n))
-                return bool(conductor.fact("scenario", "played") == str(round_ + 1))
+            def finished() -> bool:
+                bar.update(int(conductor.fact("tuner", "generation") or 0) - bar.n)
+                bar.set_description(f"best IAE {conductor.fact('tuner', 'best')[:7]:7}")
+                return conductor.fact("tuner", "state") in ("finished", "failed")
 
-            conductor.wait(played, f"the end of the episodes with {controller}", PLAY_TIMEOUT)
-        bar.update(bar.total - bar.n)
+            conductor.wait(finished, "the end of the tuning", PLAY_TIMEOUT)
+        if conductor.fact("tuner", "state") == "failed":
+            raise RuntimeError("the tuner failed: see its log above")
 
 
-_BAR = "{desc} {percentage:3.0f}% |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
-
-
-def _comparison(report: Any) -> str:
-    """The paper's metrics of each controller's episodes, measured from the bag, beside the published ones."""
-    measured: dict[tuple[str, str], Any] = {
-        (one.episode.controller, one.episode.name): one.metrics() for one in report.episodes
+def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> None:
+    """Play the case's episodes once for each set of gains, recorded, with a progress bar in simulated seconds."""
+    if not quiet:
+        print(f"Starting plant, controller, scenario and recorder in {NAMESPACE} …", flush=True)
+    lossless = {"lossless": True}
+    nodes: dict[str, dict[str, Any]] = {
+        "recorder": {"bag": bag, **lossless},
+        "plant": lossless,
+        "controller": lossless,
+        "scenario": {"play": False},
     }
+    with _loop(nodes) as conductor:
+        conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
+        episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
+        with tqdm(total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR) as bar:
+            for round_, (name, gains) in enumerate(rounds.items()):
+                bar.set_description(f"{name:17}")
+                conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
+                conductor.trigger("scenario/play")
+
+                def played(round_: int = round_) -> bool:
+                    done = int(conductor.fact("plant", "episode") or 0) - 1 - round_ * len(episode_s)
+                    if 0 <= done < len(episode_s):
+                        position = round_ * sum(episode_s) + sum(episode_s[:done]) + conductor.time_ns / 1e9
+                        bar.update(max(0.0, min(position, bar.total) - bar.n))
+                    return bool(conductor.fact("scenario", "played") == str(round_ + 1))
+
+                conductor.wait(played, f"the end of the episodes with {name}", PLAY_TIMEOUT)
+            bar.update(bar.total - bar.n)
+
+
+_TUNING_BAR = "{desc} |{bar:30}| generation {n:.0f}/{total:.0f} [{elapsed}]"
+_PLAYING_BAR = "{desc} |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
+
+
+def _comparison(report: Any, rounds: list[str], episodes: int) -> str:
+    """The paper's metrics of each round, measured from the bag, beside the published ones."""
     lines = ["", f"{'measured (published)':21}" + "".join(f"{name:>20}" for name in METRICS)]
-    for controller in COMPARED:
-        row = published(CASE, controller)
-        lines.append(f"{controller:21}" + "".join(_cell(measured, controller, row, *METRICS[name]) for name in METRICS))
-    lines.append("This row of the paper does not come out exactly under its stated conventions: docs/reproduction.md says why.")
+    for i, name in enumerate(rounds):
+        measured = {one.episode.name: one.metrics() for one in report.episodes[i * episodes : (i + 1) * episodes]}
+        row = published(CASE, controller_type(name)) if name in COMPARED else None
+        lines.append(f"{name:21}" + "".join(_cell(measured, row, *METRICS[metric]) for metric in METRICS))
+    lines.append(
+        "This case does not come out exactly under the paper's stated conventions: docs/reproduction.md says why."
+    )
     return "\n".join([*lines, *report.notes(), ""])
 
 
@@ -120,7 +158,7 @@ METRICS = {
 }
 
 
-def _cell(measured: dict[tuple[str, str], Any], controller: str, row: Any, episode: str, ours: str, theirs: str) -> str:
-    value = getattr(measured.get((controller, episode)), ours, None)
+def _cell(measured: dict[str, Any], row: Any, episode: str, ours: str, theirs: str) -> str:
+    value = getattr(measured.get(episode), ours, None)
     shown = "-" if value is None else f"{value:.4g}"
-    return f"{f'{shown} ({getattr(row, theirs):.4g})':>20}"
+    return f"{shown if row is None else f'{shown} ({getattr(row, theirs):.4g})':>20}"

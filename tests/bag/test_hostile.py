@@ -1,6 +1,7 @@
 """Damaged and hostile files: one BagError, bounded memory, nothing else."""
 
 import contextlib
+import os
 import random
 import sqlite3
 import struct
@@ -312,7 +313,8 @@ def test_chunk_bombs_take_bounded_memory(tmp_path) -> None:
         [sys.executable, "-c", BOMB, str(tmp_path)],
         capture_output=True,
         text=True,
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parent,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
         check=False,
     )
     assert done.returncode == 0, done.stderr
