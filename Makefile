@@ -10,7 +10,7 @@ demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

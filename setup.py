@@ -19,6 +19,7 @@ BENCH = ["control==0.10.2", "simple-pid==2.0.1", "optuna==5.0.0", "pymoo==0.6.2"
 TEST = [
     "pytest>=8",
     "pytest-timeout",
+    "pytest-xdist",
     "hypothesis",
     "ruff",
     "mypy",
