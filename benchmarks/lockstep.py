@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from pathlib import Path
 
 from benchmarks.harness import Result, Verdict, main, summary
 from benchmarks.ping_pong import EXECUTORS, round_trips_per_second
+from benchmarks.recorder import run_loop
 
 QUESTION = "Lockstep steps per second over DDS, plant and controller in two processes"
-NAMESPACE = "/bench"
-TIMEOUT = 300.0  # s
 
 
 def run(size: str) -> Result:
@@ -42,35 +40,8 @@ def run(size: str) -> Result:
 
 def steps_per_second(lanes: int, steps: int, recorded: bool) -> float:
     """One episode of Process 1 through the nodes, from the reset to its end."""
-    from tdof_npid_ros.case import load_case
-    from tdof_npid_ros.graph.conductor import Conductor
-    from tdof_npid_ros.graph.processes import NodeProcesses
-
-    case = load_case("p1-c0.5")
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "bench.yaml"
-        file.write_text(
-            f"/**: {{ros__parameters: {{sample_period: {case.sample_period}, mode: lockstep}}}}\n"
-            f"/**/plant: {{ros__parameters: {{lanes: {lanes}}}}}\n"
-            f"/**/controller: {{ros__parameters: {{kp: {[9.4] * lanes}, ki: 9.4, kd: 2.1, alpha: 0.3}}}}\n"
-            "/**/scenario: {ros__parameters: {play: false, episodes: [run], plan: {run: "
-            f'["0 setpoint 1", "{steps * case.sample_period} end"]}}}}}}\n'
-        )
-        with NodeProcesses(file, NAMESPACE) as nodes:
-            if recorded:
-                nodes.start("recorder", {"bag": Path(folder) / "bag"})
-            for node in ("plant", "controller", "scenario"):
-                nodes.start(node)
-            conductor = Conductor(NAMESPACE, nodes.check)
-            try:
-                watched = {"output": 1 + recorded, "control_effort": 1 + recorded, "scenario_plan": 2 + recorded}
-                conductor.wait_for_subscriptions(watched, TIMEOUT)
-                start = time.monotonic()
-                conductor.trigger("scenario/play")
-                conductor.wait(lambda: conductor.fact("plant", "state") == "finished", "the episode's end", TIMEOUT)
-                return steps / (time.monotonic() - start)
-            finally:
-                conductor.close()
+        return run_loop(Path(folder), steps, {} if recorded else None, lanes)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ def run(size: str) -> Result:
     return result
 
 
-def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None) -> float:
+def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None, lanes: int = 1) -> float:
     """One episode of Process 1 through the nodes; returns its steps per second. The bag is `folder/bag`.
 
     Args:
@@ -75,7 +75,8 @@ def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None) -> floa
     file = folder / "bench.yaml"
     file.write_text(
         f"/**: {{ros__parameters: {{sample_period: {period}, mode: lockstep}}}}\n"
-        "/**/controller: {ros__parameters: {kp: 9.4, ki: 9.4, kd: 2.1, alpha: 0.3}}\n"
+        f"/**/plant: {{ros__parameters: {{lanes: {lanes}}}}}\n"
+        f"/**/controller: {{ros__parameters: {{kp: {[9.4] * lanes}, ki: 9.4, kd: 2.1, alpha: 0.3}}}}\n"
         "/**/scenario: {ros__parameters: {play: false, episodes: [run], plan: {run: "
         f'["0 setpoint 1", "{steps * period} end"]}}}}}}\n'
     )
