@@ -1,6 +1,7 @@
 """A bare ping-pong of JointState messages between two processes: the limit of any lockstep loop over rclpy.
 
-`python -m benchmarks.ping_pong ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second.
+One message is on its way at a time, as in the loop, and it is as long as the loop's. `python -m benchmarks.ping_pong
+ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from array import array
 
 EXECUTORS = ("events", "default")
 DISCOVERY_TIMEOUT = 30.0  # s
+WARM_UP = 500  # round trips
+FRAME_ID = {"ping": "b109e267f7fe/1", "pong": "cf011c08c487 b109e267f7fe/1"}  # as long as the loop's
 
 
 def round_trips_per_second(executor: str, lanes: int, messages: int) -> float:
@@ -46,35 +49,36 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     executor.add_node(node)
     values = array("d", [0.5] * lanes)
     message = JointState(position=values, effort=values)
-    count = 0
+    message.header.frame_id = FRAME_ID[role]
+    stamp = message.header.stamp
     other = "pong" if role == "ping" else "ping"
     publisher = node.create_publisher(JointState, role, QoSProfile(depth=1000))
 
-    def answer(received: JointState) -> None:
-        nonlocal count
-        count += 1
-        if role == "pong" or count < messages:
+    def pong(received: JointState) -> None:
+        message.header.stamp = received.header.stamp
+        publisher.publish(message)
+
+    def ping(received: JointState) -> None:
+        if received.header.stamp.sec == stamp.sec:  # else a repetition from the time of discovery
+            stamp.sec += 1
             publisher.publish(message)
 
-    node.create_subscription(JointState, other, answer, QoSProfile(depth=1000))
-    deadline = time.monotonic() + DISCOVERY_TIMEOUT
-    while role == "ping" and not (publisher.get_subscription_count() and node.count_publishers(other)):
-        if time.monotonic() > deadline:
-            sys.exit("the two processes did not find each other")
-        executor.spin_once(timeout_sec=0.05)
-    if role == "ping":
-        start = time.monotonic()
-        while count == 0:  # the first messages may be lost while the two meet
-            publisher.publish(message)
-            executor.spin_once(timeout_sec=0.2)
-        count, start = 0, time.monotonic()
-        publisher.publish(message)
-        while count < messages:
-            executor.spin_once(timeout_sec=0.5)
-        print(messages / (time.monotonic() - start))
-    else:
+    node.create_subscription(JointState, other, ping if role == "ping" else pong, QoSProfile(depth=1000))
+    if role == "pong":
         while rclpy.ok():
             executor.spin_once(timeout_sec=0.5)
+    deadline = time.monotonic() + DISCOVERY_TIMEOUT
+    while stamp.sec == 0:  # until the two have met
+        if time.monotonic() > deadline:
+            sys.exit("the two processes did not find each other")
+        publisher.publish(message)
+        executor.spin_once(timeout_sec=0.2)
+    while stamp.sec < WARM_UP:
+        executor.spin_once(timeout_sec=0.5)
+    first, start = stamp.sec, time.monotonic()
+    while stamp.sec < first + messages:
+        executor.spin_once(timeout_sec=0.5)
+    print((stamp.sec - first) / (time.monotonic() - start))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import socket
 import sys
@@ -21,6 +22,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from tdof_npid_ros.case import config_folder
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
 from tdof_npid_ros.graph.timing import collect_garbage
@@ -32,6 +34,7 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durabi
 DIAGNOSTICS_PERIOD = 1.0  # s
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+FAST_DDS_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable; other middlewares do not look at it
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
@@ -233,6 +236,7 @@ class StartError(RuntimeError):
 
 
 def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> LoopNode:
+    os.environ.setdefault(FAST_DDS_PROFILE, str(config_folder() / "fastdds.xml"))
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()

@@ -52,6 +52,7 @@ class PlantNode(LoopNode):
         self.checked({})
         self.accept_changes()
         self.make_simulator()
+        self.simulator.warm_up()
         self.way_of_running = MODES[self.mode](self)
 
     def _declare_model(self) -> None:
