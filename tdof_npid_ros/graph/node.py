@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import socket
 import sys
@@ -22,9 +21,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from tdof_npid_ros.case import config_folder
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
+from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
 
 SIGNAL_QOS = signal_qos(1000)
@@ -34,7 +33,6 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durabi
 DIAGNOSTICS_PERIOD = 1.0  # s
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-FAST_DDS_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable; other middlewares do not look at it
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
@@ -236,7 +234,7 @@ class StartError(RuntimeError):
 
 
 def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> LoopNode:
-    os.environ.setdefault(FAST_DDS_PROFILE, str(config_folder() / "fastdds.xml"))
+    use_fast_dds_profile()
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
 
 
@@ -96,6 +97,7 @@ class Graph:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.experimental import EventsExecutor
 
+        use_fast_dds_profile()
         base = int(os.environ.get("ROS_DOMAIN_ID", os.getpid() * DOMAINS % 90))
         self.domain = (base + next(DOMAIN_NUMBERS) % DOMAINS) % 102
         self.folder = folder
