@@ -126,7 +126,7 @@ class ControllerNode(LoopNode):
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
         recent = signal_qos(RECENT, p["deadline"] if p["request_deadline"] else 0.0)
-        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos)
+        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
@@ -239,6 +239,11 @@ class ControllerNode(LoopNode):
         effort.position = as_field(setpoint)
         # The first answer within a running loop bears the integral action that it began with, for `verify`.
         effort.velocity = as_field(self.controller.integral_before) if begins_within else NO_VALUES
+
+    def _on_effort_matched(self, status: Any) -> None:
+        """A reader of `control_effort` has come. A plant in lockstep may be waiting for what it could not hear yet."""
+        if status.current_count_change > 0 and "/" in self.effort_for[1]:
+            self.effort_publisher.publish(self.effort)
 
     def _note_answer(self, is_new: bool) -> None:
         controller = self.controller
