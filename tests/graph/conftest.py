@@ -1,7 +1,12 @@
 """Real nodes as real processes over real DDS, for the tests of the graph.
 
 A test takes the fixture `graph`: a DDS domain of its own, in which it starts nodes and looks on through one node of
-its own. Nothing sleeps for a fixed time: `wait_until` spins until a condition holds.
+its own. Nothing sleeps for a fixed time: `wait_until` spins until a condition holds. Three things mislead a test that
+looks on from outside, and each has its remedy here:
+
+* A message is lost if the other side has not matched yet, and so is an answer to it: `publish_until` repeats it.
+* A line may be in a log already: `expect_log` waits for a further one.
+* A fact of the diagnostics is up to a second old: `fresh_fact` waits for a report that was made after the call.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOMAINS = 10  # used in turn, so that a killed node's remains are gone when its domain comes round again
 START_TIMEOUT = 60.0  # s; generous, for a loaded machine
+REPEAT_PERIOD = 0.1  # s between two times that `publish_until` publishes
 DOMAIN_NUMBERS = itertools.count()
 
 
@@ -89,7 +96,7 @@ class Graph:
 
     Attributes:
         node: the test's own node, for whatever the methods here do not do.
-        diagnostics: the latest facts by a node's full name; `level` and `message` are among them.
+        diagnostics: the latest facts by a node's full name; `level`, `message` and `stamp_ns` are among them.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -156,10 +163,11 @@ class Graph:
         return process
 
     def wait_for_nodes(self, *names: str) -> None:
-        """Wait until nodes of these full names report on /diagnostics."""
-        for name in names:
-            self.diagnostics.pop(name, None)
-        self.wait_until(lambda: all(name in self.diagnostics for name in names), START_TIMEOUT, f"{names} to report")
+        """Wait until nodes of these full names have reported on /diagnostics what holds from now on."""
+        now = time.time_ns()
+        self.wait_until(
+            lambda: all(self.fact(name, "stamp_ns", 0) > now for name in names), START_TIMEOUT, f"{names} to report"
+        )
 
     # Waiting
 
@@ -179,9 +187,23 @@ class Graph:
     def wait_for_log(self, process: NodeProcess, text: str, timeout: float = 20.0) -> None:
         self.wait_until(lambda: text in process.log, timeout, f"{text!r} in the log of {process.node}")
 
+    @contextmanager
+    def expect_log(self, process: NodeProcess, text: str, timeout: float = 20.0) -> Iterator[None]:
+        """What is done within makes a node log a further line with this text; at the end, wait for it."""
+        before = process.log.count(text)
+        yield
+        self.wait_until(
+            lambda: process.log.count(text) > before, timeout, f"one more {text!r} in the log of {process.node}"
+        )
+
     def fact(self, node: str, name: str, default: Any = "") -> Any:
         """A fact of a node's latest diagnostics."""
         return self.diagnostics.get(node, {}).get(name, default)
+
+    def fresh_fact(self, node: str, name: str, default: Any = "") -> Any:
+        """A fact as it is now, out of a report that the node makes after the call."""
+        self.wait_for_nodes(node)
+        return self.fact(node, name, default)
 
     # Topics, services, parameters
 
@@ -192,10 +214,26 @@ class Graph:
         return messages
 
     def publisher(self, topic: str, message_type: Any, qos: Any = 10) -> Any:
-        """A publisher that is already matched with a subscription."""
+        """A publisher that has found a subscription, which need not have found it: see `publish_until`."""
         publisher = self.node.create_publisher(message_type, topic, qos)
         self.wait_until(publisher.get_subscription_count, START_TIMEOUT, f"a subscriber of {topic}")
         return publisher
+
+    def publish_until(
+        self, publisher: Any, message: Any, condition: Callable[[], Any], timeout: float = 20.0, what: str = "an effect"
+    ) -> Any:
+        """Publish a message again and again until the condition holds; its value is returned."""
+        next_time = 0.0
+
+        def published() -> Any:
+            nonlocal next_time
+            value = condition()
+            if not value and time.monotonic() >= next_time:
+                next_time = time.monotonic() + REPEAT_PERIOD
+                publisher.publish(message)
+            return value
+
+        return self.wait_until(published, timeout, what)
 
     def call(self, service: str, service_type: Any, request: Any = None, timeout: float = START_TIMEOUT) -> Any:
         client = self.node.create_client(service_type, service)
@@ -240,7 +278,10 @@ class Graph:
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:
             facts = {pair.key: pair.value for pair in status.values}
-            self.diagnostics[status.name] = {**facts, "level": status.level[0], "message": status.message}
+            stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            self.diagnostics[status.name] = {
+                **facts, "level": status.level[0], "message": status.message, "stamp_ns": stamp_ns
+            }  # fmt: skip
 
 
 def plain(value: Any) -> Any:

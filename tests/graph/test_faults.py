@@ -36,10 +36,10 @@ def excursion(live: Live, first: int) -> float:
 def test_a_stopped_controller(live: Live) -> None:
     live.settle()
     first, jumps_from = len(live.outputs), len(live.efforts)
-    live.controller.send(signal.SIGSTOP)
-    live.graph.wait_for_log(live.plant, "no control_effort for 0.2 s: holding the last")
-    live.controller.send(signal.SIGCONT)
-    live.graph.wait_for_log(live.plant, "control_effort comes again")
+    with live.graph.expect_log(live.plant, "no control_effort for 0.2 s: holding the last"):
+        live.controller.send(signal.SIGSTOP)
+    with live.graph.expect_log(live.plant, "control_effort comes again"):
+        live.controller.send(signal.SIGCONT)
     live.settle()
     assert excursion(live, first) < BOUND
     assert np.max(np.abs(np.diff([m.effort[0] for m in live.efforts[jumps_from:]]))) < JUMP
@@ -48,8 +48,8 @@ def test_a_stopped_controller(live: Live) -> None:
 def test_a_killed_controller_that_is_started_again(live: Live) -> None:
     live.settle()
     first = len(live.outputs)
-    live.controller.send(signal.SIGKILL)
-    live.graph.wait_until(lambda: live.plant.log.count("no control_effort") == 2, what="the fallback")
+    with live.graph.expect_log(live.plant, "no control_effort"):
+        live.controller.send(signal.SIGKILL)
     live.controller = live.graph.start("controller", namespace="/live", effort_min=-2.0, effort_max=3.0,
                                        output_timeout=0.2, **CONTROLLER)  # fmt: skip
     live.settle()
@@ -58,15 +58,16 @@ def test_a_killed_controller_that_is_started_again(live: Live) -> None:
 
 def test_a_stopped_plant(live: Live) -> None:
     live.settle()
+    missed = int(live.graph.fresh_fact(live.plant_name, "missed_ticks", 0))
     first, jumps_from = len(live.outputs), len(live.efforts)
-    live.plant.send(signal.SIGSTOP)
-    live.graph.wait_for_log(live.controller, "no output for 0.2 s: the integral action waits")
-    live.plant.send(signal.SIGCONT)
-    live.graph.wait_for_log(live.controller, "output comes again")
+    with live.graph.expect_log(live.controller, "no output for 0.2 s: the integral action waits"):
+        live.plant.send(signal.SIGSTOP)
+    with live.graph.expect_log(live.controller, "output comes again"):
+        live.plant.send(signal.SIGCONT)
     live.settle()
     assert excursion(live, first) < BOUND
     assert np.max(np.abs(np.diff([m.effort[0] for m in live.efforts[jumps_from:]]))) < JUMP
-    live.graph.wait_until(lambda: int(live.graph.fact(live.plant_name, "missed_ticks", 0)) >= 10, what="missed ticks")
+    assert int(live.graph.fresh_fact(live.plant_name, "missed_ticks", 0)) >= missed + 10
 
 
 def test_random_parameter_changes(live: Live) -> None:
@@ -132,22 +133,28 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
     makers["/live/scenario_plan"] = (JointTrajectory, plan)
     for topic, (kind, make) in makers.items():
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        publisher = live.graph.node.create_publisher(kind, topic, latched)
-        live.graph.wait_until(publisher.get_subscription_count, what=f"a subscriber of {topic}")
-        refused = count_of_rejections(live)
+        publisher = live.graph.publisher(topic, kind, latched)
+        refused = fresh_rejections(live)
+        live.graph.publish_until(
+            publisher, make(), lambda n=refused: rejections(live) > n, what=f"a rejection of {topic}"
+        )
         for _ in range(MALFORMED):
             publisher.publish(make())
             live.graph.spin_once(0.0)
-        live.graph.wait_until(lambda n=refused: count_of_rejections(live) > n, what=f"rejections of {topic}")
         live.graph.node.destroy_publisher(publisher)
     live.settle()
     assert excursion(live, first) < BOUND
     assert live.controller.log.count("scenario_plan refused") == 1  # each cause once
 
 
-def count_of_rejections(live: Live) -> int:
+def rejections(live: Live) -> int:
     nodes = (live.controller_name, live.plant_name)
     return sum(int(live.graph.fact(node, name, 0)) for node in nodes for name in ("rejected", "late"))
+
+
+def fresh_rejections(live: Live) -> int:
+    live.graph.wait_for_nodes(live.controller_name, live.plant_name)
+    return rejections(live)
 
 
 def test_a_clock_that_is_set_back_or_forward(live: Live) -> None:
@@ -161,11 +168,15 @@ def test_a_clock_that_is_set_back_or_forward(live: Live) -> None:
     now, y = 1e6, 0.5
 
     def answer(stamp: float) -> float:
-        message, count = JointState(position=[y], effort=[0.3]), len(efforts)
+        message = JointState(position=[y], effort=[0.3])
         message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
-        output.publish(message)
-        graph.wait_until(lambda: len(efforts) > count, what="an answer")
-        return float(efforts[-1].effort[0])
+        answered = graph.publish_until(
+            output,
+            message,
+            lambda: [m for m in efforts[-5:] if m.header.stamp == message.header.stamp],
+            what="an answer",
+        )
+        return float(answered[0].effort[0])
 
     assert answer(now) == pytest.approx(0.3)  # it begins within a running loop, from the effort that the robot has
     steady = [answer(now + 0.01 * k) for k in range(1, 10)]
@@ -175,8 +186,8 @@ def test_a_clock_that_is_set_back_or_forward(live: Live) -> None:
 
 
 def test_a_killed_plant_that_is_started_again(live: Live) -> None:
-    live.plant.send(signal.SIGKILL)
-    live.graph.wait_for_log(live.controller, "no output for 0.2 s")
+    with live.graph.expect_log(live.controller, "no output for 0.2 s"):
+        live.plant.send(signal.SIGKILL)
     live.plant = live.graph.start("plant", namespace="/live", fallback="hold", effort_timeout=0.2, **PLANT)
     began = time.monotonic()
     live.settle()

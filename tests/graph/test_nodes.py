@@ -98,9 +98,9 @@ def test_controller_killed_and_restarted(graph: Any) -> None:
     controller = graph.start("controller")
     graph.start("scenario", mode="lockstep", episodes=["e"], plan__e=["0 setpoint 1", "3000 end"])
     graph.wait_until(lambda: int(graph.fact("/plant", "steps", 0)) > 100, 60, "steps")
-    controller.send(signal.SIGKILL)
-    graph.wait_for_log(plant, "stopped")
-    graph.wait_until(lambda: graph.fact("/plant", "state") == "stopped")
+    with graph.expect_log(plant, ": stopped. Start a controller"):
+        controller.send(signal.SIGKILL)
+    assert graph.fresh_fact("/plant", "state") == "stopped"
     assert "start one" in graph.fact("/plant", "message")
     before = int(graph.fact("/plant", "steps"))
     graph.start("controller")
@@ -166,10 +166,26 @@ class TestController:
     """Refusals of one controller that goes on."""
 
     def answer(self, loop: Any, *position: float) -> Any:
-        publish_output(loop, *position)
-        count = len(loop.efforts)
-        loop.wait_until(lambda: len(loop.efforts) > count, what="an answer")
-        return loop.efforts[-1]
+        """The answer to the next output."""
+        loop.time_ns += PERIOD_NS
+        return self.answer_again(loop, *position)
+
+    def answer_again(self, loop: Any, *position: float) -> Any:
+        """The answer to an output with the stamp of the latest."""
+        message, count = output_message(loop.time_ns, *position), len(loop.efforts)
+        answered = loop.publish_until(
+            loop.output,
+            message,
+            lambda: [m for m in loop.efforts[count:] if m.header.stamp == message.header.stamp],
+            what="an answer",
+        )
+        return answered[0]
+
+    def wait_for_rejection(self, loop: Any, publisher: Any, message: Any) -> None:
+        rejected = int(loop.fresh_fact("/c/controller", "rejected", 0))
+        loop.publish_until(
+            publisher, message, lambda: int(loop.fact("/c/controller", "rejected", 0)) > rejected, what="a rejection"
+        )
 
     @pytest.mark.parametrize(
         ("values", "reason"),
@@ -201,27 +217,31 @@ class TestController:
         loop.wait_for_log(loop.process, "effort_max: inf -> 50")
 
     def test_bad_outputs_are_counted_and_change_nothing(self, loop: Any) -> None:
-        self.answer(loop, 0.1)
-        answered, latest = len(loop.efforts), loop.efforts[-1]
+        latest = self.answer(loop, 0.1)
         stamp_ns = loop.time_ns
         for bad in ((math.nan,), (-math.inf,), (), (1.0, 2.0)):
-            rejected = int(loop.fact("/c/controller", "rejected", 0))
-            publish_output(loop, *bad)
-            loop.wait_until(lambda n=rejected: int(loop.fact("/c/controller", "rejected", 0)) > n, what="a rejection")
-        assert len(loop.efforts) == answered
-        loop.time_ns = stamp_ns - PERIOD_NS
-        assert self.answer(loop, 0.1).effort == latest.effort  # the same stamp again: no state has advanced
+            loop.time_ns += PERIOD_NS
+            self.wait_for_rejection(loop, loop.output, output_message(loop.time_ns, *bad))
+        assert max(stamps(loop.efforts)) == stamp_ns
+        loop.time_ns = stamp_ns
+        assert self.answer_again(loop, 0.1).effort == latest.effort  # no state has advanced
         assert loop.process.log.count("output that is not finite refused") == 1
 
     def test_bad_setpoints_are_refused(self, loop: Any) -> None:
         from sensor_msgs.msg import JointState
 
         setpoint = loop.publisher("/c/setpoint", JointState)
-        rejected = int(loop.fact("/c/controller", "rejected", 0))
+        loop.publish_until(
+            setpoint,
+            JointState(position=[0.25]),
+            lambda: list(self.answer(loop, 0.1).position) == [0.25],
+            what="the setpoint to be taken",
+        )
+        rejected = int(loop.fresh_fact("/c/controller", "rejected", 0))
         for position in ([math.nan], [1.0, 2.0, 3.0], [], [-math.inf]):
             setpoint.publish(JointState(position=position))
         loop.wait_until(lambda: int(loop.fact("/c/controller", "rejected", 0)) == rejected + 4, what="4 rejections")
-        assert list(self.answer(loop, 0.1).position) == [0.0]
+        assert list(self.answer(loop, 0.1).position) == [0.25]
         assert loop.process.log.count("setpoint") == 1
 
     def test_bad_plans_are_refused(self, loop: Any) -> None:
@@ -239,9 +259,7 @@ class TestController:
             JointTrajectory(joint_names=["setpoint"], points=[point, JointTrajectoryPoint(
                 positions=[1.0], time_from_start=Duration(sec=1))]),
         ):  # fmt: skip
-            rejected = int(loop.fact("/c/controller", "rejected", 0))
-            plan.publish(message)
-            loop.wait_until(lambda n=rejected: int(loop.fact("/c/controller", "rejected", 0)) > n, what="a rejection")
+            self.wait_for_rejection(loop, plan, message)
 
     def test_idle_uses_no_measurable_processor_time(self, loop: Any) -> None:
         stat = Path(f"/proc/{loop.process.process.pid}/stat")
@@ -255,10 +273,9 @@ class TestController:
         assert ticks() - before <= 6  # of 200 hundredths of a second; it publishes diagnostics once a second
 
 
-def publish_output(loop: Any, *position: float) -> None:
+def output_message(time_ns: int, *position: float) -> Any:
     from sensor_msgs.msg import JointState
 
-    loop.time_ns += PERIOD_NS
     message = JointState(position=position)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(loop.time_ns, 1_000_000_000)
-    loop.output.publish(message)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 1_000_000_000)
+    return message

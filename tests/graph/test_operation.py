@@ -95,8 +95,9 @@ def test_manual_mode_by_topic_and_bumpless_return(live: Live) -> None:
         0
     ].successful
     live.graph.wait_until(lambda: live.efforts[-1].effort[0] == 1.1, what="the parameter's effort")
-    by_hand.publish(JointState(effort=[0.9]))
-    live.graph.wait_until(lambda: live.efforts[-1].effort[0] == 0.9, what="the topic's effort")
+    live.graph.publish_until(
+        by_hand, JointState(effort=[0.9]), lambda: live.efforts[-1].effort[0] == 0.9, what="the topic's effort"
+    )
     live.settle(0.9, 0.1)
     before = [live.efforts[-1].effort[0]]
     assert live.graph.set_parameters(live.controller_name, manual=False)[0].successful
@@ -109,8 +110,8 @@ def test_inactive_publishes_nothing_and_comes_back_without_a_jump(live: Live) ->
     assert live.graph.set_parameters(live.plant_name, fallback="hold")[0].successful
     assert live.graph.change_state(live.controller_name, "deactivate")
     live.graph.wait_until(lambda: live.graph.node.count_publishers("/live/control_effort") == 0, what="silence")
-    live.graph.wait_until(lambda: live.graph.fact(live.plant_name, "state") == "fallback", what="the plant's fallback")
-    live.graph.wait_until(lambda: "inactive" in live.graph.fact(live.controller_name, "message"))
+    live.graph.wait_until(lambda: live.graph.fresh_fact(live.plant_name, "state") == "fallback", what="the fallback")
+    assert "inactive" in live.graph.fresh_fact(live.controller_name, "message")
     count, applied = len(live.efforts), live.outputs[-1].effort[0]
     for _ in range(2):  # and once more: activation and deactivation leave nothing behind
         assert live.graph.change_state(live.controller_name, "activate")
@@ -132,8 +133,7 @@ def test_a_held_controller_waits_for_its_supervisor(graph: Any) -> None:
     assert graph.change_state("/controller", "configure")
     assert graph.change_state("/controller", "activate")
     output = graph.publisher("output", JointState)
-    output.publish(JointState(position=[0.0]))
-    graph.wait_until(lambda: efforts, what="an effort")
+    graph.publish_until(output, JointState(position=[0.0]), lambda: efforts, what="an effort")
 
 
 def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
@@ -145,12 +145,11 @@ def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
     joint_states = graph.publisher("joint_states", JointState)
     message = JointState(name=["base", "wrist", "elbow"], position=[9.0, 1.5, 0.25], velocity=[0.0] * 3)
     message.header.frame_id = "base_link"
-    joint_states.publish(message)
-    graph.wait_until(lambda: efforts, what="an effort")
+    graph.publish_until(joint_states, message, lambda: efforts, what="an effort")
     assert list(efforts[0].name) == ["elbow", "wrist"]
     assert list(efforts[0].effort) == [2.0 * 0.75, 3.0 * 0.5]
-    joint_states.publish(JointState(name=["base", "elbow"], position=[0.0, 0.0]))
-    graph.wait_for_log(controller, "has no joint wrist")
+    incomplete = JointState(name=["base", "elbow"], position=[0.0, 0.0])
+    graph.publish_until(joint_states, incomplete, lambda: "has no joint wrist" in controller.log, what="a refusal")
 
 
 def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
@@ -169,7 +168,7 @@ def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
     graph.start("controller", "--params-file", str(file), namespace="/b")
     graph.wait_for_nodes("/b/controller")
     assert graph.get_parameters("/b/controller", *names) == values
-    graph.wait_for_nodes("/a/controller")
+    graph.wait_for_nodes("/a/controller", "/b/controller")
     assert graph.fact("/b/controller", "parameters") == graph.fact("/a/controller", "parameters")
 
 

@@ -73,9 +73,14 @@ def test_topics_that_appear_later_and_best_effort_ones(graph: Any, tmp_path: Pat
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64
 
-    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"), topics=["temperature", "output"])
     graph.wait_for_nodes("/recorder")
+
+    def recorded() -> int:
+        return int(graph.fact("/recorder", "recorded", 0))
+
     late = graph.publisher("temperature", Float64)
+    graph.publish_until(late, Float64(data=-1.0), recorded, what="the recorder to find the topic")
     # A robot that offers less than the loop's own nodes.
     weak = graph.node.create_publisher(
         JointState, "output", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -83,11 +88,14 @@ def test_topics_that_appear_later_and_best_effort_ones(graph: Any, tmp_path: Pat
     graph.wait_until(weak.get_subscription_count, 20, "the recorder to subscribe as best effort")
     for value in range(5):
         late.publish(Float64(data=float(value)))
-        weak.publish(JointState(position=[float(value)]))
-    graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > 10, 20, "the recorder to record")
+    before = int(graph.fresh_fact("/recorder", "recorded", 0))
+    graph.publish_until(
+        weak, JointState(position=[1.0]), lambda: recorded() > before, what="the weak topic to be recorded"
+    )
     recorder.stop()
     with BagReader(tmp_path / "bag") as reader:
-        assert reader.columns("/temperature")["data"].tolist() == [0, 1, 2, 3, 4]
+        temperatures = reader.columns("/temperature")["data"].tolist()
+        assert temperatures[-5:] == [0, 1, 2, 3, 4] and set(temperatures[:-5]) == {-1}
         assert reader.topics["/output"].count >= 1
 
 

@@ -204,14 +204,16 @@ def test_a_loop_killed_half_way_loses_its_share_and_is_used_again_when_it_is_bac
 def test_a_run_killed_and_started_again_ends_as_one_left_alone(
     loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path
 ) -> None:
+    from rclpy.qos import DurabilityPolicy, QoSProfile
     from sensor_msgs.msg import JointState
 
+    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     parameters = {
         "type": "npid", "seed": 6, **QUICK, "generations": 12,
         "checkpoint": str(tmp_path / "checkpoint.json"), "result": str(tmp_path / "tuned.yaml"), "loops": ["/p1"],
     }  # fmt: skip
     case = tuner_file("p1-c0.5")
-    progress = loops.collect("tuning_progress", JointState)
+    progress = loops.collect("tuning_progress", JointState, latched)
     killed = loops.start("tuner", "-p", f"case:={case}", **parameters)
     loops.wait_until(lambda: progress and progress[-1].position[1] >= 4, 60, "the fourth generation")
     killed.send(signal.SIGKILL)
@@ -223,7 +225,7 @@ def test_a_run_killed_and_started_again_ends_as_one_left_alone(
     study.run(Objective(which))
     assert read_parameters(tmp_path / "tuned.yaml", "controller") == study.result.gains.as_dict()
     assert "confirmed" in again.log
-    assert progress[-1].position[0] == study.best_value
+    loops.wait_until(lambda: progress[-1].position[0] == study.best_value, what="the last progress")
     assert list(progress[-1].name) == ["best", "generation", "evaluations", "budget", "kp", "ki", "kd"]
     gains = study.result.gains
     assert loops.get_parameters("/p1/controller", "type", "kp", "ki") == ["npid", gains.kp, gains.ki]
