@@ -16,7 +16,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.bag.recover import recover
 
 KILLS = budget("TDOF_NPID_KILLS", 20)  # issue 5 asks for 200 once
-TRUNCATIONS = budget("TDOF_NPID_TRUNCATIONS", 300)  # and 2000
+TRUNCATIONS = -(-budget("TDOF_NPID_TRUNCATIONS", 300) // 3)  # for each compression; issue 5 asks for 2000 in all once
 SECOND_NS = 10**9
 AT_ONCE = 4
 
@@ -85,7 +85,7 @@ def test_truncated_anywhere(tmp_path, compression) -> None:
     counts = [piece.load().length.size for piece in file.pieces()]
     file.close()
     chance = random.Random(2)
-    cuts = range(len(whole)) if len(whole) <= TRUNCATIONS // 3 else chance.sample(range(len(whole)), TRUNCATIONS // 3)
+    cuts = range(len(whole)) if len(whole) <= TRUNCATIONS else chance.sample(range(len(whole)), TRUNCATIONS)
     path = tmp_path / "cut.mcap"
     for cut in cuts:
         path.write_bytes(whole[:cut])

@@ -24,8 +24,9 @@ from tdof_npid_ros.bag.definition import parse
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.bag.recover import recover
 
-MUTATIONS = budget("TDOF_NPID_FUZZ", 600)  # issue 5 asks for 10,000 once
-EXAMPLES = budget("TDOF_NPID_FUZZ", 300)
+# More than 10,000 inputs in each run; TDOF_NPID_FUZZ=10000 gives each test so many.
+MUTATIONS = budget("TDOF_NPID_FUZZ", 4000)
+EXAMPLES = budget("TDOF_NPID_FUZZ", 1000)
 
 
 def read_all(path) -> int:
