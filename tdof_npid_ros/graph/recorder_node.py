@@ -169,7 +169,8 @@ class RecorderNode(LoopNode):
         if tap is not None and any(qos_check_compatible(qos, tap.qos)[0] == QoSCompatibility.ERROR for qos in offered):
             self.get_logger().warning(f"{topic}: a publisher offers less than the others: subscribing again")
             self._close(topic)
-            tap, types = None, [tap.type_name]
+            types = [tap.type_name]
+            tap = None
         if tap is None:
             try:
                 tap = self._tap(topic, _recordable(types), _as_reliable_as(offered))
