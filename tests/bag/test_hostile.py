@@ -156,6 +156,9 @@ def test_mutated_sqlite_bags_raise_nothing_but_bag_errors(tmp_path) -> None:
         "UPDATE topics SET name = CAST(x'ff' AS TEXT)",
         "UPDATE messages SET data = x'00' WHERE id = 5",
         "DROP TABLE messages",
+        "DROP TABLE messages; CREATE TABLE messages"
+        "(id INTEGER, topic_id INTEGER, timestamp INTEGER, data AS (zeroblob(200000000)))",
+        "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
         "DROP TABLE messages; CREATE VIEW messages AS SELECT 1 id, 1 topic_id, 1 timestamp, x'' data",
     ],
 )
