@@ -177,8 +177,7 @@ class McapFile:
         self.dropped_bytes += size
 
     def _walk(self) -> int:
-        """Find the pieces; return where the data section ends, or the last whole record of an unfinished"
-        " file."""
+        """Find the pieces; return where the data section ends, or the last whole record of an unfinished file."""
         position = len(records.MAGIC)
         while True:
             head = self._read(position, _HEAD_BYTES)

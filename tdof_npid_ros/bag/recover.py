@@ -1,5 +1,4 @@
-"""Rewrite a bag that a crash has cut off, or that is damaged, into a whole one, and account for what is"
-" missing."""
+"""Rewrite a bag that a crash has cut off, or that is damaged, into a whole one, and account for what is missing."""
 
 from __future__ import annotations
 
@@ -118,9 +117,7 @@ class _Recovery:
     def _announce(self, topic: TopicInfo) -> None:
         if topic.name not in self._topic_ids:
             if topic.encoding != "ros2msg":
-                raise BagError(
-                    f"topic {topic.name} is not CDR with a definition in ros2msg: it cannot be recovered"
-                )
+                raise BagError(f"topic {topic.name} is not CDR with a definition in ros2msg: it cannot be recovered")
             self._topic_ids[topic.name] = self._writer.add_topic(
                 topic.name, topic.type, qos=topic.qos, definition=topic.definition, type_hash=topic.type_hash
             )
