@@ -21,7 +21,15 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import NO_VALUES, as_field, plan_from_message, signal_message, stamp_ns, values
+from tdof_npid_ros.graph.messages import (
+    NO_VALUES,
+    as_field,
+    lane_names,
+    plan_from_message,
+    signal_message,
+    stamp_ns,
+    values,
+)
 from tdof_npid_ros.graph.node import (
     ERROR,
     LATCHED_QOS,
@@ -120,7 +128,6 @@ class ControllerNode(LoopNode):
         self.latest_arrival_ns: int | None = None
         self.silent = False
         self.effort = signal_message("")
-        self.effort.name = self.joints.names
         self.effort_for = ("", "")
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
@@ -264,6 +271,7 @@ class ControllerNode(LoopNode):
     def _publish_answer(self, output: JointState, episode: str) -> None:
         if self.effort_for != (self.controller.digest, episode):
             self.effort_for = (self.controller.digest, episode)
+            self.effort.name = self.joints.names or lane_names(self.controller.lanes)
             self.effort.header.frame_id = f"{self.controller.digest} {episode}" if episode else self.controller.digest
         self.effort.header.stamp = output.header.stamp
         self.effort.effort = as_field(self.controller.effort)
