@@ -38,6 +38,8 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
+    from tdof_npid_ros.graph.messages import lane_names
+
     rclpy.init()
     node = rclpy.create_node(role)
     if executor_name == "events":
@@ -48,7 +50,7 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
         executor = SingleThreadedExecutor()
     executor.add_node(node)
     values = array("d", [0.5] * lanes)
-    message = JointState(position=values, effort=values)
+    message = JointState(name=lane_names(lanes), position=values, effort=values)
     message.header.frame_id = FRAME_ID[role]
     stamp = message.header.stamp
     other = "pong" if role == "ping" else "ping"

@@ -22,7 +22,15 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import NO_VALUES, as_field, plan_from_message, signal_message, stamp_ns, values
+from tdof_npid_ros.graph.messages import (
+    NO_VALUES,
+    as_field,
+    lane_names,
+    plan_from_message,
+    signal_message,
+    stamp_ns,
+    values,
+)
 from tdof_npid_ros.graph.node import (
     ERROR,
     LATCHED_QOS,
@@ -121,7 +129,6 @@ class ControllerNode(LoopNode):
         self.silent = False
         self.common_setpoint = np.zeros(self.controller.lanes)
         self.effort = signal_message("")
-        self.effort.name = self.joints.names
         self.effort_for = ("", "")
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
@@ -233,6 +240,7 @@ class ControllerNode(LoopNode):
         effort, header, digest = self.effort, self.effort.header, self.controller.digest
         if self.effort_for != (digest, episode):
             self.effort_for = (digest, episode)
+            effort.name = self.joints.names or lane_names(self.controller.lanes)
             header.frame_id = f"{digest} {episode}" if episode else digest
         header.stamp = stamp
         effort.effort = as_field(self.controller.effort)

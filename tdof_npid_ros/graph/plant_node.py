@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import as_field, set_stamp, signal_message, values
+from tdof_npid_ros.graph.messages import as_field, lane_names, set_stamp, signal_message, values
 from tdof_npid_ros.graph.node import LoopNode, number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
@@ -51,6 +51,7 @@ class PlantNode(LoopNode):
         )
         self.checked({})
         self.accept_changes()
+        self.output = signal_message("")
         self.make_simulator()
         self.simulator.warm_up()
         self.way_of_running = MODES[self.mode](self)
@@ -89,7 +90,7 @@ class PlantNode(LoopNode):
 
     def activate(self) -> None:
         """Create topics, services and timers."""
-        self.output = signal_message("")
+        self.output.header.frame_id = ""
         promised = self.values_of(["deadline", "lease"])
         deadline = promised["deadline"] if self.mode == "realtime" else 0.0
         qos = signal_qos(1000, deadline, promised["lease"])
@@ -123,6 +124,7 @@ class PlantNode(LoopNode):
         """Begin again, at the initial state, with the parameters as they are now."""
         lanes = int(self.values_of(["lanes"])["lanes"])
         self.simulator = PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
+        self.output.name = lane_names(lanes)
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
