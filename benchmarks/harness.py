@@ -205,6 +205,11 @@ def machine() -> dict[str, Any]:
     }
 
 
+def last_line(output: str) -> str:
+    """What a program printed last: the middleware may have printed its own complaints before."""
+    return output.strip().splitlines()[-1]
+
+
 def _compiler() -> str:
     try:
         return subprocess.run(["gcc", "--version"], capture_output=True, text=True).stdout.partition("\n")[0] or "none"

@@ -8,11 +8,12 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
 from benchmarks.harness import Dots, Result, Table, main
-from benchmarks.tuning import BUDGET, Counted, Optimise, TargetReachedError, ask_tell, pymoo, scipy_de
+from benchmarks.tuning import BUDGET, Counted, Optimise, TargetReachedError, ask_tell, pymoo
 
 TITLE = "The HGA on standard test functions"
 METHOD = (
@@ -70,21 +71,27 @@ FUNCTIONS: dict[str, tuple[Function, float, float]] = {  # and the bounds of eve
 
 
 def _scipy_polished(objective: Counted, lower: np.ndarray, upper: np.ndarray, seed: int) -> None:
-    from scipy.optimize import differential_evolution
+    from scipy.optimize import Bounds, differential_evolution
 
     # Its polish takes some hundred evaluations; the generations get the rest.
     generations = (objective.budget - 400) // (8 * len(lower)) - 1
+    def evaluate(x: Any) -> Any:  # a generation (d, n), or in the polish one point (d,)
+        return objective(x.T) if x.ndim == 2 else float(objective(x)[0])
+
     differential_evolution(
-        lambda x: objective(x.T) if x.ndim == 2 else float(objective(x)[0]), list(zip(lower, upper, strict=True)),
-        rng=seed, vectorized=True, updating="deferred", popsize=8, maxiter=max(1, generations), polish=True,
+        evaluate, Bounds(lower, upper), rng=seed, vectorized=True, updating="deferred", popsize=8,
+        maxiter=max(1, generations), polish=True,
     )  # fmt: skip
 
 
 def _dual_annealing(objective: Counted, lower: np.ndarray, upper: np.ndarray, seed: int) -> None:
-    from scipy.optimize import dual_annealing
+    from scipy.optimize import Bounds, dual_annealing
 
-    bounds = list(zip(lower, upper, strict=True))
-    dual_annealing(lambda x: float(objective(x)[0]), bounds, rng=seed, maxiter=objective.budget, maxfun=objective.budget)
+    def evaluate(x: Any) -> Any:
+        return float(objective(x)[0])
+
+    budget = objective.budget
+    dual_annealing(evaluate, Bounds(lower, upper), rng=seed, maxiter=budget, maxfun=budget)
 
 
 OPTIMISERS: dict[str, Optimise] = {

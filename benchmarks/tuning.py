@@ -95,11 +95,14 @@ def ask_tell(algorithm: str, polish: int | None = None) -> Optimise:
 
 def scipy_de(objective: Counted, lower: np.ndarray, upper: np.ndarray, seed: int) -> None:
     """SciPy's differential evolution, whole generations at a time."""
-    from scipy.optimize import differential_evolution
+    from scipy.optimize import Bounds, differential_evolution
+
+    def evaluate(x: Any) -> Any:
+        return objective(x.T)
 
     differential_evolution(
-        lambda x: objective(x.T), list(zip(lower, upper, strict=True)), rng=seed, vectorized=True, updating="deferred",
-        popsize=8, maxiter=100_000, tol=0.0, atol=0.0, polish=False,
+        evaluate, Bounds(lower, upper), rng=seed, vectorized=True, updating="deferred", popsize=8, maxiter=100_000,
+        tol=0.0, atol=0.0, polish=False,
     )  # fmt: skip
 
 
@@ -163,7 +166,7 @@ OPTIMISERS: dict[str, tuple[Optimise, int]] = {  # and their budgets
 def run(size: str) -> Result:
     """Every optimiser on every row with many seeds, spread over the cores."""
     full = size == "full"
-    rows = [(row.case, row.controller) for row in (ROWS if full else ROWS[1:2])]
+    rows: list[Row] = [(row.case, row.controller) for row in (ROWS if full else ROWS[1:2])]
     names = list(OPTIMISERS)
     seeds = SEEDS if full else SEEDS[:1]
     # Small: a tenth of the budget, to see that each runs.
@@ -185,19 +188,19 @@ def _one(work: tuple[str, Row, int, bool]) -> Run:
     known = tuned(*row)  # type: ignore[arg-type]
     if known is None:
         raise RuntimeError(f"no tuned gains for {row[1]} on {row[0]}")
-    objective, bounds = _objective(row, (), seed, known.objective * WITHIN, budget if full else budget // 10)
+    objective, lower, upper = _objective(row, (), seed, known.objective * WITHIN, budget if full else budget // 10)
     start = time.perf_counter()
     with contextlib.suppress(TargetReachedError):
-        optimise(objective, *bounds, seed)
+        optimise(objective, lower, upper, seed)
     return Run(name, row, objective.reached, time.perf_counter() - start)
 
 
 def _reaches_published(work: tuple[Row, int]) -> bool:
     row, seed = work
     (published,) = (one.objective for one in ROWS if (one.case, one.controller) == row)
-    objective, bounds = _objective(row, free_at_published(row), seed, published, BUDGET)
+    objective, lower, upper = _objective(row, free_at_published(row), seed, published, BUDGET)
     with contextlib.suppress(TargetReachedError):
-        ask_tell("hga")(objective, *bounds, seed)
+        ask_tell("hga")(objective, lower, upper, seed)
     return objective.reached < math.inf
 
 
@@ -206,10 +209,13 @@ def free_at_published(row: Row) -> tuple[str, ...]:
     return ("sigma",) if row[0].startswith("p3") and row[1] != "pid" else ()
 
 
-def _objective(row: Row, extra: tuple[str, ...], seed: int, target: float, budget: int) -> tuple[Counted, np.ndarray]:
+def _objective(
+    row: Row, extra: tuple[str, ...], seed: int, target: float, budget: int
+) -> tuple[Counted, np.ndarray, np.ndarray]:
     case = load_case(row[0])
     problem = TuningProblem(case, row[1], extra, case.weight, seed=seed)  # type: ignore[arg-type]
-    return Counted(Objective(problem, threads=1), target, budget), np.array(problem.bounds).T
+    lower, upper = np.array(problem.bounds).T
+    return Counted(Objective(problem, threads=1), target, budget), lower, upper
 
 
 def _state_evaluations(result: Result, runs: list[Run], rows: list[Row], names: list[str]) -> None:

@@ -45,7 +45,7 @@ def run(size: str) -> Result:
             for name, write in writers.items():
                 with tempfile.TemporaryDirectory() as folder:
                     bag = Path(folder) / "bag"
-                    taken = seconds(lambda write=write, bag=bag: write(bag, made, compression))  # type: ignore[misc]
+                    taken = seconds(lambda write=write, bag=bag, how=compression: write(bag, made, how))  # type: ignore[misc]
                     speeds[name].append(messages / taken)
                     if write is write_ours:
                         lost += messages - _count(bag)
@@ -124,7 +124,7 @@ def _count(bag: Path) -> int:
         summary_ = make_reader(file).get_summary()
         chunks = sum(1 for _ in make_reader(file).iter_messages())
     assert summary_ is not None and summary_.statistics is not None
-    return min(chunks, summary_.statistics.message_count)
+    return min(chunks, int(summary_.statistics.message_count))
 
 
 if __name__ == "__main__":
