@@ -6,10 +6,13 @@ ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second.
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
 from array import array
+
+from benchmarks.harness import last_line
 
 EXECUTORS = ("events", "default")
 DISCOVERY_TIMEOUT = 30.0  # s
@@ -25,16 +28,16 @@ def round_trips_per_second(executor: str, lanes: int, messages: int) -> float:
         ping = subprocess.run(
             [*command, "ping", executor, str(lanes), str(messages)], capture_output=True, text=True, check=True
         )
-        return float(ping.stdout)
+        return float(last_line(ping.stdout))
     finally:
-        pong.kill()
+        pong.terminate()  # not killed: it leaves its shared memory in order
         pong.wait()
 
 
 def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     """One of the two processes."""
     import rclpy
-    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
@@ -68,7 +71,9 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     node.create_subscription(JointState, other, ping if role == "ping" else pong, QoSProfile(depth=1000))
     if role == "pong":
         while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
+            with contextlib.suppress(ExternalShutdownException):
+                executor.spin_once(timeout_sec=0.5)
+        return
     deadline = time.monotonic() + DISCOVERY_TIMEOUT
     while stamp.sec == 0:  # until the two have met
         if time.monotonic() > deadline:
