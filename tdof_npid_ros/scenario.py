@@ -25,6 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tdof_npid_ros.control.gains import LARGEST_SIGNAL
+
 SIGNALS = ("setpoint", "disturbance")
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
 GRAMMAR = (
@@ -106,6 +108,8 @@ class Plan:
                 raise PlanError(f"point {i} has {len(row)} values for {len(self.names)} signals")
             if not all(map(math.isfinite, row)):
                 raise PlanError(f"point {i} at {time / 1e9:g} s holds a value that is not finite: {list(row)}")
+            if any(abs(value) > LARGEST_SIGNAL for value in row):
+                raise PlanError(f"point {i} at {time / 1e9:g} s holds a value beyond {LARGEST_SIGNAL:g}: {list(row)}")
 
     @property
     def end_ns(self) -> int:

@@ -22,6 +22,10 @@ TUNED: dict[ControllerType, tuple[str, ...]] = {
 }  # the gains that the paper tunes for each type (section 3.3)
 PER_LANE = ("kp", "ki", "kd", "alpha", "beta", "sigma")
 
+# Within these bounds no effort overflows, whatever the gains, setpoints and outputs are.
+LARGEST_GAIN = 1e50  # in SI units, of the absolute value; 1/LARGEST_GAIN is the smallest sigma
+LARGEST_SIGNAL = 1e100  # of setpoints and outputs
+
 Lanes = float | tuple[float, ...]
 
 
@@ -73,8 +77,13 @@ class Gains:
             for value in _as_tuple(getattr(self, name)):
                 if not math.isfinite(value):
                     raise GainsError(f"{name} is {value}: it must be finite")
-        if any(sigma <= 0 for sigma in _as_tuple(self.sigma)):
-            raise GainsError(f"sigma is {self.sigma}: it must be above 0 (a large one makes the law nearly linear)")
+                if abs(value) > LARGEST_GAIN:
+                    raise GainsError(f"{name} is {value}: it must be within +-{LARGEST_GAIN:g}")
+        if any(sigma < 1.0 / LARGEST_GAIN for sigma in _as_tuple(self.sigma)):
+            raise GainsError(
+                f"sigma is {self.sigma}: it must be above 0, at least {1.0 / LARGEST_GAIN:g} "
+                "(a large one makes the law nearly linear)"
+            )
         if not 0 < self.n < math.inf:
             raise GainsError(f"n is {self.n}: the derivative filter needs a finite n above 0 (usual: 5 to 30)")
         if not 0 <= self.tracking_time < math.inf:
@@ -82,10 +91,7 @@ class Gains:
                 f"tracking_time is {self.tracking_time} s: it must be finite and not below 0 (0: automatic)"
             )
         for low, high in (("effort_min", "effort_max"), ("integral_min", "integral_max")):
-            if not getattr(self, low) <= getattr(self, high):
-                raise GainsError(
-                    f"{low} is {getattr(self, low)} and {high} is {getattr(self, high)}: need {low} <= {high}"
-                )
+            check_limits(self, low, high)
         lanes = self.lanes
         for name in PER_LANE:
             length = len(_as_tuple(getattr(self, name)))
@@ -140,6 +146,15 @@ def gains_from_mapping(values: Mapping[str, Any]) -> Gains:
         GainsError: a value has the wrong type or range.
     """
     return Gains(**{name: values[name] for name in GAIN_NAMES if name in values})
+
+
+def check_limits(values: Any, low: str, high: str) -> None:
+    """Raise GainsError unless there are finite numbers between the attributes `low` and `high`."""
+    lower, upper = getattr(values, low), getattr(values, high)
+    if not lower <= upper:
+        raise GainsError(f"{low} is {lower} and {high} is {upper}: need {low} <= {high}")
+    if lower == math.inf or upper == -math.inf:
+        raise GainsError(f"{low} is {lower} and {high} is {upper}: no finite number is within")
 
 
 def number_of(name: str, value: Any) -> float:

@@ -119,8 +119,9 @@ def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -
     c[KP] = kp
     c[KI_H] = h * ki
     # T_f = K_d/(K_p N); without derivative action it is 0 and the filter follows at once.
-    rate = np.divide(kp * gains.n, kd, out=np.full(lanes, np.inf), where=kd != 0)
-    c[PHI] = _exp_minus(h * rate)
+    with np.errstate(over="ignore"):  # a rate that is infinite is a filter that follows at once
+        rate = h * np.divide(kp * gains.n, kd, out=np.full(lanes, np.inf), where=kd != 0)
+    c[PHI] = _exp_minus(rate)
     c[KD_H] = kd / h * (1.0 - c[PHI])
     if gains.type in ("tdof_npid1", "tdof_npid2"):
         c[ALPHA] = alpha
@@ -129,7 +130,8 @@ def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -
     if gains.type != "pid":
         c[HALF_INVERSE_SIGMA2] = 1.0 / (2.0 * sigma * sigma)
     if gains.anti_windup == "back_calculation":
-        c[TRACKING] = 1.0 - _exp_minus(h / tracking_time(gains, lanes))
+        with np.errstate(over="ignore"):
+            c[TRACKING] = 1.0 - _exp_minus(h / tracking_time(gains, lanes))
     conditional = float(gains.anti_windup == "conditional")
     return c, (gains.effort_min, gains.effort_max, gains.integral_min, gains.integral_max, conditional)
 

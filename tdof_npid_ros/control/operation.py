@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.control.gains import Gains, GainsError, Lanes, lanes_of, number_of
+from tdof_npid_ros.control.gains import Gains, GainsError, Lanes, check_limits, lanes_of, number_of
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,7 @@ class Operation:
                 object.__setattr__(self, field.name, number_of(field.name, value))
         if not np.isfinite(self.manual_effort).all():
             raise GainsError(f"manual_effort is {self.manual_effort}: it must be finite")
-        if not self.setpoint_min <= self.setpoint_max:
-            raise GainsError(
-                f"setpoint_min is {self.setpoint_min} and setpoint_max is {self.setpoint_max}: "
-                "need setpoint_min <= setpoint_max"
-            )
+        check_limits(self, "setpoint_min", "setpoint_max")
         for name in ("setpoint_rate", "effort_rate"):
             if not getattr(self, name) > 0:
                 raise GainsError(f"{name} is {getattr(self, name)}: it must be above 0 (inf: no limit)")

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, Gains, gains_from_mapping
+from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, LARGEST_SIGNAL, Gains, gains_from_mapping
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
@@ -73,6 +73,7 @@ DESCRIPTIONS = {
     "bumpless": "true: changes of gains and type do not move the effort at once",
 }
 SECONDS = {"output_timeout": (0.0, 3600.0), "deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}
+SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
 
 class ControllerNode(LoopNode):
@@ -114,7 +115,12 @@ class ControllerNode(LoopNode):
         )
         declare("deadline", 0.0, "s between two efforts that is promised on control_effort; 0: no promise", fixed=True)
         declare("lease", 1.0, "s; lease of the liveliness promised on control_effort; 0: no promise", fixed=True)
-        declare("request_deadline", False, "refuse publishers of output that promise no deadline", fixed=True)
+        declare(
+            "request_deadline",
+            False,
+            "take output only from publishers that promise this deadline and lease",
+            fixed=True,
+        )
         declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
         declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
 
@@ -132,19 +138,21 @@ class ControllerNode(LoopNode):
         self.effort_for = ("", "")
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
-        recent = signal_qos(RECENT, p["deadline"] if p["request_deadline"] else 0.0)
+        recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
         self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
         self.subscribe(JointState, "manual_effort", self._on_manual_effort, signal_qos(1))
         self.subscribe(JointState, "output", self._on_output, recent, sole=True)
-        if self.output_timeout_ns:
-            self.create_timer(self.output_timeout_ns / 1e9, self._look_for_silence, clock=STEADY)
+        self.create_timer(SILENCE_LOOKS, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:
         """Keep what outlasts an inactive time."""
-        self.saved_integral = self.controller.integral if self.values_of(["save_i_term"])["save_i_term"] else None
+        if not self.values_of(["save_i_term"])["save_i_term"]:
+            self.saved_integral = None
+        elif self.controller.stamp_ns is not None:
+            self.saved_integral = self.controller.integral
 
     # What arrives
 
@@ -162,7 +170,7 @@ class ControllerNode(LoopNode):
         r = self._picked("setpoint", message.name, message.position)
         if r is None:
             return
-        if len(r) not in (1, self.controller.lanes) or not np.isfinite(r).all():
+        if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
             self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
             self.setpoint = r.copy()
@@ -216,14 +224,14 @@ class ControllerNode(LoopNode):
             self.get_logger().info("output comes again: going on")
         if not (restarts or was_silent):
             return False
+        saved, self.saved_integral = self.saved_integral, None
         if restarts and begins_from_nothing(stamp, episode):
             self.controller.reset()
             return False
         applied = self._applied(message)
         if applied is None:
             return False
-        self.controller.begin_within(applied, self.saved_integral)
-        self.saved_integral = None
+        self.controller.begin_within(applied, saved if saved is not None and len(saved) == len(applied) else None)
         return True
 
     def _applied(self, message: JointState) -> np.ndarray | None:
@@ -278,14 +286,14 @@ class ControllerNode(LoopNode):
         lanes = self.controller.lanes
         if len(y) != lanes:
             self.refuse("rejected", "output refused", f": it has {len(y)} values, the gains are for {lanes} lanes")
-        elif not (math.isfinite(y[0]) if lanes == 1 else np.isfinite(y).all()):
+        elif not (abs(y[0]) if lanes == 1 else np.abs(y).max()) <= LARGEST_SIGNAL:  # nan is not, either
             self.refuse("rejected", "output that is not finite refused")
         else:
             return True
         return False
 
     def _look_for_silence(self) -> None:
-        if self.silent or self.latest_arrival_ns is None or "/" in self.effort_for[1]:
+        if self.silent or not self.output_timeout_ns or self.latest_arrival_ns is None or "/" in self.effort_for[1]:
             return
         if time.monotonic_ns() - self.latest_arrival_ns > self.output_timeout_ns:
             self.silent = True
@@ -340,7 +348,7 @@ class ControllerNode(LoopNode):
 
     def _setpoint(self, value: Any) -> np.ndarray:
         one_per_lane = value if isinstance(value, list) else [value]
-        return np.array([number("setpoint", one, -1e300, 1e300) for one in one_per_lane])
+        return np.array([number("setpoint", one, -LARGEST_SIGNAL, LARGEST_SIGNAL) for one in one_per_lane])
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import signal
 import socket
@@ -48,12 +49,15 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     uses_events_executor = True
 
     def __init__(self, name: str) -> None:
+        self._activating = False
         super().__init__(name)
         self.counts: Counter[str] = Counter()
         self.quiet_parameters: set[str] = set()  # changes of them are not logged: they come from a topic
         self.active = False
         self.activation_error: Exception | None = None
+        self._why_inactive = "inactive: waits for its activation"
         self.endpoints = Endpoints(self, self.refuse)
+        self._refuse_impossible_transitions()
         self._warned: set[str] = set()
         self.autostart = bool(
             self.declare_value("autostart", True, "activate at once; false: wait for a supervisor's transitions")
@@ -85,7 +89,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self, message_type: Any, topic: str, qos: QoSProfile, matched: Callable[[Any], None] | None = None
     ) -> Any:
         """A publisher that reports missed deadlines and profiles that do not fit."""
-        events = self.endpoints.publisher_events(topic, matched)
+        events = self.endpoints.publisher_events(topic, matched and self._while_active(matched))
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def subscribe(
@@ -94,6 +98,32 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         """A subscription that reports profiles that do not fit and, if one publisher is expected, a second one."""
         events = self.endpoints.subscription_events(topic, sole)
         self.create_subscription(message_type, topic, callback, qos, event_callbacks=events)
+
+    # What `activate` creates is destroyed by a transition, yet an executor may hold a call of it that was due before.
+
+    def create_subscription(
+        self, message_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
+    ) -> Any:
+        """As `Node.create_subscription`; one made in `activate` is silent once the node is inactive."""
+        return super().create_subscription(message_type, topic, self._while_active(callback), *args, **kw)
+
+    def create_timer(self, period: float, callback: Callable[..., Any], *args: Any, **kw: Any) -> Any:
+        """As `Node.create_timer`; one made in `activate` is silent once the node is inactive."""
+        return super().create_timer(period, self._while_active(callback), *args, **kw)
+
+    def create_service(self, service_type: Any, name: str, callback: Callable[..., Any], *args: Any, **kw: Any) -> Any:
+        """As `Node.create_service`; one made in `activate` answers with nothing done once the node is inactive."""
+        return super().create_service(service_type, name, self._while_active(callback), *args, **kw)
+
+    def _while_active(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        if not self._activating:
+            return callback
+
+        @functools.wraps(callback)  # rclpy looks at the signature
+        def guarded(*args: Any) -> Any:
+            return callback(*args) if self.active else args and args[-1]  # for a service: its response, as it was
+
+        return guarded
 
     # Parameters
 
@@ -140,7 +170,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def publish_diagnostics(self) -> None:
         """Publish the node's state and counts now; it happens once a second anyway."""
-        level, text, facts = self.state() if self.active else (WARN, "inactive: waits for its activation", {})
+        level, text, facts = self.state() if self.active else (WARN, self._why_inactive, {})
         if self.endpoints.conflicts:
             level, text = max(level, WARN), "; ".join([text, *self.endpoints.conflicts])
         stamp = self.get_clock().now().to_msg()
@@ -154,9 +184,25 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     # Life cycle
 
+    def _refuse_impossible_transitions(self) -> None:
+        """Answer that a transition failed which the present state does not have; rclpy would end the process."""
+        (service,) = (each for each in self.services if each.srv_name.endswith("/change_state"))
+        change_state = service.callback
+
+        def guarded(request: Any, response: Any) -> Any:
+            try:
+                return change_state(request, response)
+            except RuntimeError:
+                self.get_logger().warning(f"transition {request.transition.id} refused: not possible in this state")
+                response.success = False
+                return response
+
+        service.callback = guarded
+
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
         self._lasting = [id(entity) for _, entity in self._entities()]
+        self._activating = True
         try:
             self.activate()
         except (ValueError, OSError, RuntimeError) as error:
@@ -164,17 +210,29 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             self.get_logger().error(f"not activated: {error}")
             self._destroy_what_activate_created()
             return TransitionCallbackReturn.FAILURE
+        finally:
+            self._activating = False
         self.active = True
         self.publish_diagnostics()
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop working."""
-        self.active = False
-        self.deactivate()
-        self._destroy_what_activate_created()
-        self.publish_diagnostics()
+        self._stop_working()
         return super().on_deactivate(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop working for good, also without having been deactivated."""
+        self._why_inactive = "shut down for good: end the process, and start it again"
+        self._stop_working()
+        return super().on_shutdown(state)
+
+    def _stop_working(self) -> None:
+        if self.active:
+            self.active = False
+            self.deactivate()
+            self._destroy_what_activate_created()
+        self.publish_diagnostics()
 
     def _entities(self) -> list[tuple[Callable[[Any], bool], Any]]:
         return [

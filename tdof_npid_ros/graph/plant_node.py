@@ -70,7 +70,7 @@ class PlantNode(LoopNode):
         declare("lanes", 1, "independent copies of the plant in one message; taken over at the next reset")
         declare("effort_min", -math.inf, "lower limit of the actuator, in the effort's unit")
         declare("effort_max", math.inf, "upper limit of the actuator, in the effort's unit")
-        declare("reply_timeout", 0.5, "lockstep: s of wall time until an unanswered output is repeated")
+        declare("reply_timeout", 0.5, "lockstep: s of wall time until an unanswered output is repeated", fixed=True)
         declare("retries", 20, "lockstep: how often an output is repeated before the plant stops")
         declare("publish_clock", True, "lockstep: publish the loop's time on /clock", fixed=True)
         declare("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
@@ -84,7 +84,12 @@ class PlantNode(LoopNode):
             "deadline", 0.0, "realtime: s between two outputs that is promised on output; 0: no promise", fixed=True
         )
         declare("lease", 1.0, "s; lease of the liveliness that is promised on output; 0: no promise", fixed=True)
-        declare("request_deadline", False, "refuse publishers of control_effort that promise no deadline", fixed=True)
+        declare(
+            "request_deadline",
+            False,
+            "realtime: take control_effort only from publishers that promise this deadline and lease",
+            fixed=True,
+        )
         declare("priority", 0, "realtime: priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
         declare("cpu", -1, "realtime: number of the processor to stay on; -1: any", fixed=True)
 
@@ -153,6 +158,8 @@ class PlantNode(LoopNode):
             raise ValueError(
                 f"effort_min is {p['effort_min']} and effort_max {p['effort_max']}: need effort_min <= effort_max"
             )
+        if p["effort_min"] == math.inf or p["effort_max"] == -math.inf:
+            raise ValueError("effort_min or effort_max leaves no finite effort: set them to what the actuator can do")
 
     def changed(self, changes: dict[str, Any]) -> None:
         """Take over accepted changes."""

@@ -26,13 +26,13 @@ class RealtimePlant:
     def activate(self) -> None:
         """Create the topics and the timer."""
         node = self._node
-        p = node.values_of(["speed", "deadline", "request_deadline", "priority", "cpu"])
+        p = node.values_of(["speed", "deadline", "lease", "request_deadline", "priority", "cpu"])
         for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
             node.get_logger().warning(refusal)
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
         self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
-        self._start()
-        recent = signal_qos(RECENT, p["deadline"] if p["request_deadline"] else 0.0)
+        self.reset()
+        recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
         node.subscribe(JointState, "control_effort", self._on_effort, recent, sole=True)
         node.subscribe(JointState, "disturbance", self._on_disturbance, signal_qos(1))
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.qos import (
@@ -56,7 +57,8 @@ class RecorderNode(LoopNode):
     def __init__(self) -> None:
         super().__init__("recorder")
         default = f"bags/{time.strftime('%Y%m%d-%H%M%S')}"
-        self.folder = Path(str(self.declare_value("bag", default, "folder of the bag; must not exist", fixed=True)))
+        bag = self.declare_value("bag", default, "folder of the bag; must not exist; not to be changed while recording")
+        self.folder = self._folder(bag)
         self.compression = self.declare_value(
             "compression", "zstd", f"of the chunks: {', '.join(COMPRESSIONS)}", fixed=True
         )
@@ -117,17 +119,36 @@ class RecorderNode(LoopNode):
         """Close the bag with its account."""
         if self.writer is not None:
             self.discovery.cancel()
+            self.snapshots.stop()
             self.thread.stop()
             writer, self.writer = self.writer, None
-            writer.custom_data.update(self._account())
+            account = self._account()
+            writer.custom_data.update(account)
             try:
-                writer.write_metadata("recording", self._account())
+                writer.write_metadata("recording", account)
                 writer.close()
             except BagError as error:
                 self.failure = self.failure or str(error)
             self._let_go()
             failure = f"; {self.failure}" if self.failure else ""
-            print(f"bag {self.folder}: {self.counts['recorded']} messages, {self.lost} lost{failure}", flush=True)
+            print(f"bag {self.folder}: {account['recorded']} messages, {account['lost']} lost{failure}", flush=True)
+
+    def checked(self, changes: dict[str, Any]) -> None:
+        """Refuse another folder while recording."""
+        if "bag" in changes:
+            self._folder(changes["bag"])
+            if self.active:
+                raise ValueError("bag cannot be changed while recording: deactivate the recorder first")
+
+    def changed(self, changes: dict[str, Any]) -> None:
+        """Take over the folder of the next bag."""
+        if "bag" in changes:
+            self.folder = self._folder(changes["bag"])
+
+    def _folder(self, bag: Any) -> Path:
+        if not isinstance(bag, str) or not bag:
+            raise ValueError(f"bag is {bag!r}: it must be the path of a folder")
+        return Path(bag)
 
     # What there is to record
 

@@ -18,6 +18,8 @@ from tdof_npid_ros.graph.messages import lane_names, plan_message, set_stamp, si
 from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
 from tdof_npid_ros.scenario import Plan, parse_plan
 
+PLANT_TIMEOUT_NS = 3_000_000_000  # in realtime, an episode waits so long for a plant that can be reset
+
 
 class ScenarioNode(LoopNode):
     """Latches each episode's plan on `scenario_plan` and publishes `setpoint` and `disturbance`.
@@ -40,8 +42,7 @@ class ScenarioNode(LoopNode):
             self.declare_value("play", True, "play all episodes at the start; else at scenario/play")
         )
         self.declare_value("episodes", ["setpoint"], "names of the episodes, in the order in which they are played")
-        names = self.values_of(["episodes"])["episodes"]
-        for name in names:
+        for name in self.values_of(["episodes"])["episodes"]:
             self.declare_value(
                 f"plan.{name}", ["0 setpoint 1", "10 end"], f"lines of the episode {name}: TIME SIGNAL WHAT"
             )
@@ -55,7 +56,8 @@ class ScenarioNode(LoopNode):
         """Create topics, services and timers."""
         self.plan_publisher = self.publisher_of(JointTrajectory, "scenario_plan", LATCHED_QOS)
         self.publishers_of = {
-            name: self.publisher_of(JointState, name, SIGNAL_QOS) for name in ("setpoint", "disturbance")
+            name: self.publisher_of(JointState, name, SIGNAL_QOS, self._on_matched)
+            for name in ("setpoint", "disturbance")
         }
         self.create_service(Trigger, "scenario/play", self._on_play)
         self.plant_name = self.resolve_topic_name("plant")
@@ -98,19 +100,38 @@ class ScenarioNode(LoopNode):
         self.current = self.queue.pop(0)
         self.point, self.finished_before = -1, self.latest_episode
         self.started_ns: int | None = None
-        if self.mode == "realtime":
-            self.reset_client.wait_for_service(timeout_sec=0.0)
-            self.reset_client.call_async(Trigger.Request())
-            self.started_ns = STEADY.now().nanoseconds
-        self.plan_publisher.publish(plan_message(self.current, 0))
+        self.wait_until_ns = STEADY.now().nanoseconds + PLANT_TIMEOUT_NS
+        if self.mode == "lockstep":
+            self._publish_plan(self.current)
+
+    def _publish_plan(self, plan: Plan) -> None:
+        self.plan_publisher.publish(plan_message(plan, 0))
         self._advance_to(0)
+
+    def _begin(self, plan: Plan) -> None:
+        """In realtime: the plant to its initial state, and the plan's first values."""
+        if self.reset_client.service_is_ready():
+            self.reset_client.call_async(Trigger.Request())
+        else:
+            self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
+        self.started_ns = STEADY.now().nanoseconds
+        self._publish_plan(plan)
+
+    def _on_matched(self, status: Any) -> None:
+        """A latecomer, a controller started again for one, is told what holds now."""
+        if self.mode == "realtime" and self.current is not None and status.current_count_change > 0 <= self.point:
+            self._publish_signals(self.current, self.point)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name != self.plant_name:
                 continue
             facts = {pair.key: pair.value for pair in status.values}
-            episode = int(facts.get("episode", 0))
+            try:
+                episode = int(facts.get("episode", 0))
+            except ValueError:
+                self.refuse("rejected", "diagnostics of the plant refused: its episode is no number")
+                continue
             finished = facts.get("state") == "finished" and facts.get("plan") == getattr(self.current, "digest", None)
             if self.mode == "lockstep" and self.current and finished and episode > self.finished_before:
                 self.latest_episode = episode
@@ -121,9 +142,14 @@ class ScenarioNode(LoopNode):
         self._advance_to(stamp_ns(message.clock))
 
     def _on_tick(self) -> None:
-        if self.current is None or self.started_ns is None:
+        if self.current is None:
             return
-        now = int((STEADY.now().nanoseconds - self.started_ns) * self.speed)
+        now = STEADY.now().nanoseconds
+        if self.started_ns is None:
+            if self.reset_client.service_is_ready() or now > self.wait_until_ns:
+                self._begin(self.current)
+            return
+        now = int((now - self.started_ns) * self.speed)
         self._advance_to(now)
         if now >= self.current.end_ns:
             self._next()
@@ -135,18 +161,17 @@ class ScenarioNode(LoopNode):
             return
         while self.point + 1 < len(plan.times_ns) and plan.times_ns[self.point + 1] <= time_ns:
             self.point += 1
-            row = dict(zip(plan.names, plan.values[self.point], strict=True))
-            self._publish_signals(plan.times_ns[self.point], row)
+            self._publish_signals(plan, self.point)
             if self.mode == "realtime":
-                self._set_plant(
-                    {name.removeprefix("plant."): v for name, v in row.items() if name.startswith("plant.")}
-                )
+                row = zip(plan.names, plan.values[self.point], strict=True)
+                self._set_plant({name.removeprefix("plant."): v for name, v in row if name.startswith("plant.")})
 
-    def _publish_signals(self, time_ns: int, row: dict[str, float]) -> None:
+    def _publish_signals(self, plan: Plan, point: int) -> None:
+        row = dict(zip(plan.names, plan.values[point], strict=True))
         for name, publisher in self.publishers_of.items():
             message = signal_message("")
             message.name = lane_names(1) if name == "disturbance" else []  # a setpoint's are names of joints
-            set_stamp(message.header.stamp, time_ns)
+            set_stamp(message.header.stamp, plan.times_ns[point])
             field = "position" if name == "setpoint" else "effort"
             setattr(message, field, [row.get(name, 0.0)])
             publisher.publish(message)
@@ -164,8 +189,9 @@ class ScenarioNode(LoopNode):
     # Parameters and state
 
     def _read_plans(self, changes: dict[str, Any]) -> None:
-        names = self.values_of(["episodes"])["episodes"]
-        parameters = {"episodes": names, **self.values_of([f"plan.{name}" for name in names]), **changes}
+        names = changes.get("episodes", self.values_of(["episodes"])["episodes"])
+        declared = [f"plan.{name}" for name in names if self.has_parameter(f"plan.{name}")]
+        parameters = {"episodes": names, **self.values_of(declared), **changes}
         self.plans = {}
         for name, lines in read_episodes(parameters).items():
             self.plans[name] = parse_plan(lines, self.period_ns)

@@ -46,6 +46,8 @@ class ParameterSnapshots:
 
         def listed(future: Any) -> None:
             nonlocal asked_ns
+            if self._asked.get(full_name) != [lister, getter]:
+                return  # the node has gone, or the recorder has stopped
             asked_ns = time.time_ns()
             names = list(future.result().result.names)
             getter.call_async(GetParameters.Request(names=names)).add_done_callback(lambda f: got(names, f))
@@ -62,6 +64,11 @@ class ParameterSnapshots:
             self._take(event, asked_ns)
 
         lister.call_async(ListParameters.Request()).add_done_callback(listed)
+
+    def stop(self) -> None:
+        """Ask nobody any more."""
+        for full_name in list(self._asked):
+            self._forget(full_name)
 
     def _forget(self, full_name: str) -> None:
         for client in self._asked.pop(full_name):

@@ -61,4 +61,5 @@ class FailSafe:
         if passed >= self._return_ns:
             self._returned_ns = None
             return self._effort
-        return np.asarray(self._from + (self._effort - self._from) * (passed / self._return_ns))
+        share = passed / self._return_ns
+        return np.asarray(self._from * (1.0 - share) + self._effort * share)

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.control.controller import Controller, parameters_digest
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, GainsError
+from tdof_npid_ros.control.gains import (
+    CONTROLLER_TYPES,
+    LARGEST_GAIN,
+    LARGEST_SIGNAL,
+    AntiWindup,
+    ControllerType,
+    Gains,
+    GainsError,
+    gains_from_mapping,
+)
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 
 H = 0.01  # s
@@ -245,3 +254,42 @@ assert compiled() == before
 
 def test_nothing_is_compiled_while_the_loop_runs() -> None:
     subprocess.run([sys.executable, "-c", ANSWERS_OF_ALL_KINDS], check=True)
+
+
+@pytest.mark.parametrize("kind", CONTROLLER_TYPES)
+@pytest.mark.parametrize("anti_windup", ["none", "conditional", "back_calculation"])
+def test_no_effort_is_ever_infinite_or_nan(kind: ControllerType, anti_windup: AntiWindup) -> None:
+    """With the largest and smallest gains, signals, filters and limits that are not refused."""
+    rng = np.random.default_rng(1)
+    extremes = [0.0, 1.0 / LARGEST_GAIN, 1e-9, 1.0, 1e9, LARGEST_GAIN]
+    signals = [s * sign for s in (0.0, 1e-300, 1.0, LARGEST_SIGNAL) for sign in (1.0, -1.0)]
+    for _ in range(300):
+        values = {name: float(rng.choice(extremes)) for name in ("kp", "ki", "kd", "alpha", "beta")}
+        values["kd"] *= values["kp"] != 0.0  # T_d = kd/kp
+        values |= {"sigma": float(rng.choice(extremes[1:])), "n": float(rng.choice([5e-324, 1.0, 1e308]))}
+        values |= {
+            "tracking_time": float(rng.choice([0.0, 5e-324, 1e308])),
+            "effort_max": float(rng.choice([1.0, math.inf])),
+        }
+        operation = Operation(
+            filter_time=float(rng.choice([0.0, 5e-324, 1e308])),
+            dead_band=float(rng.choice([0.0, 1e308])),
+            setpoint_rate=float(rng.choice([5e-324, math.inf])),
+            manual=bool(rng.random() < 0.1),
+        )
+        controller = Controller(Gains(kind, anti_windup=anti_windup, **values), PERIOD_NS, operation)
+        if rng.random() < 0.5:
+            controller.begin_within(np.array([rng.choice([-1e308, 1e308])]))
+        for k in range(20):
+            controller.answer(k * PERIOD_NS, np.array([rng.choice(signals)]), np.array([rng.choice(signals)]))
+            assert np.isfinite(controller.effort[0]) and np.isfinite(controller.terms).all(), (values, operation)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [("effort_min", "effort_max"), ("integral_min", "integral_max"), ("setpoint_min", "setpoint_max")]
+)
+def test_limits_that_leave_no_finite_value_are_refused(low: str, high: str) -> None:
+    kind = operation_from_mapping if low == "setpoint_min" else gains_from_mapping
+    for limits in ({low: math.inf}, {high: -math.inf}, {low: math.inf, high: math.inf}):
+        with pytest.raises(GainsError, match=f"{low} is"):
+            kind(limits)

@@ -7,11 +7,15 @@ import os
 import random
 import signal
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from test_operation import CONTROLLER, PLANT, Live
+
+from tdof_npid_ros.analysis.verify import verify
 
 BOUND = 0.5  # of the setpoint: how far the output may go in any of these faults, but for the loss of the plant itself
 JUMP = 0.25  # largest step of the effort between two samples while parameters change at random
@@ -68,6 +72,39 @@ def test_a_stopped_plant(live: Live) -> None:
     assert excursion(live, first) < BOUND
     assert np.max(np.abs(np.diff([m.effort[0] for m in live.efforts[jumps_from:]]))) < JUMP
     assert int(live.graph.fresh_fact(live.plant_name, "missed_ticks", 0)) >= missed + 10
+
+
+@pytest.mark.parametrize("node", ["scenario", "recorder"])
+def test_an_onlooker_stopped_killed_and_started_again(live: Live, node: str, tmp_path: Path) -> None:
+    """The loop does not need scenario and recorder: with them stopped or gone, nothing moves."""
+    graph = live.graph
+
+    def start() -> Any:
+        options = {"bag": str(tmp_path / "bag")} if node == "recorder" else {"play": False}
+        return graph.start(node, namespace=live.namespace, **options)
+
+    def bounded(action: Callable[[], None]) -> None:
+        live.settle()
+        first, efforts_from = len(live.outputs), len(live.efforts)
+        action()
+        live.settle()
+        live.settle()
+        assert excursion(live, first) < BOUND
+        assert np.max(np.abs(np.diff([m.effort[0] for m in live.efforts[efforts_from:]]))) < JUMP
+
+    name = f"{live.namespace}/{node}"
+    process = start()
+    graph.wait_for_nodes(name)
+    bounded(lambda: process.send(signal.SIGSTOP))
+    bounded(lambda: process.send(signal.SIGCONT))
+    graph.wait_for_nodes(name)
+    bounded(lambda: process.send(signal.SIGKILL))
+    if node == "recorder":
+        assert verify(tmp_path / "bag").different == 0
+        (tmp_path / "bag").rename(tmp_path / "killed")
+    process = start()
+    graph.wait_for_nodes(name)
+    process.stop()
 
 
 def test_random_parameter_changes(live: Live) -> None:
@@ -130,6 +167,7 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
     makers = {
         f"/live/{name}": (JointState, signal_) for name in ("output", "setpoint", "control_effort", "disturbance")
     }
+    makers["/live/manual_effort"] = (JointState, signal_)
     makers["/live/scenario_plan"] = (JointTrajectory, plan)
     for topic, (kind, make) in makers.items():
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -147,6 +185,47 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
     assert live.controller.log.count("scenario_plan refused") == 1  # each cause once
 
 
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_malformed_diagnostics_clocks_and_accounts_end_no_node(graph: Any, mode: str) -> None:
+    """What scenario and plant hear of each other, forged."""
+    from builtin_interfaces.msg import Time
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Header
+
+    rng = random.Random(2)
+    words = ["", "x", "-1", "9" * 5000, "nan", "finished", "\u0663", "1e9"]
+
+    def diagnostics() -> Any:
+        facts = [
+            KeyValue(key=key, value=rng.choice(words)) for key in ("episode", "state", "plan") if rng.random() < 0.9
+        ]
+        return DiagnosticArray(status=[DiagnosticStatus(name="/plant", level=b"\xff", values=facts)])
+
+    def time() -> Any:
+        return Time(sec=rng.randint(-(2**31), 2**31 - 1), nanosec=rng.randint(0, 2**32 - 1))
+
+    plan = ["0 setpoint 1", "0 plant.gain 1", "3000 end"]
+    plant = graph.start("plant", mode=mode, lossless=True)
+    controller = graph.start("controller")
+    scenario = graph.start("scenario", mode=mode, episodes=["e"], plan__e=plan)
+    graph.wait_for_nodes("/plant", "/controller", "/scenario")
+    makers = {
+        "/diagnostics": (DiagnosticArray, diagnostics),
+        "/clock": (Clock, lambda: Clock(clock=time())),
+        "/recorded": (JointState, lambda: JointState(header=Header(stamp=time(), frame_id=rng.choice(words)))),
+    }
+    for topic, (kind, make) in makers.items():
+        publisher = graph.node.create_publisher(kind, topic, 10)
+        for _ in range(MALFORMED):
+            publisher.publish(make())
+            graph.spin_once(0.0)
+    graph.wait_for_nodes("/plant", "/controller", "/scenario")
+    assert int(graph.fact("/scenario", "rejected", 0)) > 0
+    assert all(process.process.poll() is None for process in (plant, controller, scenario))
+
+
 def rejections(live: Live) -> int:
     nodes = (live.controller_name, live.plant_name)
     return sum(int(live.graph.fact(node, name, 0)) for node in nodes for name in ("rejected", "late"))
@@ -155,6 +234,39 @@ def rejections(live: Live) -> int:
 def fresh_rejections(live: Live) -> int:
     live.graph.wait_for_nodes(live.controller_name, live.plant_name)
     return rejections(live)
+
+
+NODES = ("plant", "controller", "scenario", "recorder", "tuner")
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_random_parameters_of_every_node_are_accepted_or_refused_whole(graph: Any, node: str, tmp_path: Path) -> None:
+    from rcl_interfaces.srv import ListParameters
+
+    arguments = {"recorder": ["-p", f"bag:={tmp_path / 'bag'}"], "tuner": ["-p", "case:=p1-c0.5"]}.get(node, [])
+    process = graph.start(node, *arguments)
+    name = f"/{node}"
+    graph.wait_for_nodes(name)
+    names = list(graph.call(f"{name}/list_parameters", ListParameters).result.names)
+    rng = random.Random(node)
+    wild = [None, True, 0, -7, 2**62, 0.5, -1.0, 1e300, math.nan, -math.inf, "", "x", [b"x", b"y"], [], [True], [0, 1], [1.0],
+            [math.nan], ["0 setpoint 1", "1 end"], ["a", ""]]  # fmt: skip
+    for _ in range(CHANGES):
+        changes = {one: rng.choice(wild) for one in rng.sample(names, rng.choice([1, 1, 2, 3]))}
+        before = graph.get_parameters(name, *names)
+        (result,) = graph.set_parameters(name, atomically=True, **changes)
+        after = graph.get_parameters(name, *names)
+        for one, was, now in zip(names, before, after, strict=True):
+            expected = changes[one] if result.successful and one in changes else was
+            assert same(now, expected), (changes, one, was, now, process.log)
+        assert result.successful or result.reason
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two parameters are equal, nan included."""
+    return repr(list(one) if hasattr(one, "__len__") and not isinstance(one, str) else one) == repr(
+        list(other) if hasattr(other, "__len__") and not isinstance(other, str) else other
+    )
 
 
 def test_a_clock_that_is_set_back_or_forward(live: Live) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -123,6 +126,84 @@ def test_inactive_publishes_nothing_and_comes_back_without_a_jump(live: Live) ->
     live.settle()
 
 
+@pytest.mark.parametrize(("save_i_term", "goes_on"), [(True, 0.75), (False, 0.5)])
+def test_the_integral_action_is_saved_while_inactive(graph: Any, save_i_term: bool, goes_on: float) -> None:
+    """Saved, it is what the answer is computed with; else the effort goes on from what the plant reports."""
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    graph.start("controller", type="pid", kp=1.0, ki=1.0, save_i_term=save_i_term)
+    output = graph.publisher("output", JointState)
+
+    def answer(k: int, y: float, applied: float) -> float:
+        message = JointState(position=[y], effort=[applied])
+        message.header.stamp.sec = 10 + k
+        return float(
+            graph.publish_until(
+                output,
+                message,
+                lambda: [m for m in efforts if m.header.stamp == message.header.stamp],
+                what="an answer",
+            )[0].effort[0]
+        )
+
+    assert answer(0, 0.0, 0.75) == 0.75  # within a running loop: the integral action is 0.75
+    assert graph.change_state("/controller", "deactivate")
+    assert graph.change_state("/controller", "activate")
+    assert answer(1, 0.0, 0.5) == goes_on
+    assert graph.change_state("/controller", "deactivate")  # and gains for more lanes meanwhile do no harm
+    assert graph.set_parameters("/controller", kp=[1.0, 2.0])[0].successful
+    assert graph.change_state("/controller", "activate")
+    message = JointState(position=[0.0, 0.0], effort=[0.5, 0.25])
+    message.header.stamp.sec = 20
+    graph.publish_until(output, message, lambda: efforts[-1].header.stamp.sec == 20, what="an answer")
+    assert list(efforts[-1].effort) == [0.5, 0.25]
+
+
+@pytest.mark.parametrize("node", ["plant", "controller", "scenario", "recorder"])
+def test_every_transition_of_the_life_cycle(graph: Any, node: str, tmp_path: Path) -> None:
+    """configure, activate, deactivate, cleanup and around again; shutdown ends the work also of an active node."""
+    parameters = {"bag": str(tmp_path / "bag")} if node == "recorder" else {}
+    process = graph.start(node, autostart=False, **parameters)
+    name = f"/{node}"
+    graph.wait_for_nodes(name)
+    asleep = own_endpoints(graph, node)
+    for rounds in range(2):
+        for transition in ("configure", "activate", "deactivate", "cleanup"):
+            assert graph.change_state(name, transition), process.log
+            graph.wait_for_nodes(name)
+            assert ("inactive" in graph.fact(name, "message")) == (transition != "activate")
+        graph.wait_until(lambda: own_endpoints(graph, node) == asleep, what="what `activate` created to be gone")
+        if node == "recorder":
+            assert graph.set_parameters(name, bag=str(tmp_path / f"bag{rounds}"))[0].successful
+    assert graph.change_state(name, "configure") and graph.change_state(name, "activate")
+    assert graph.change_state(name, "inactive_shutdown") is False  # it is active
+    assert graph.change_state(name, "active_shutdown")
+    assert "shut down" in graph.fresh_fact(name, "message")
+    graph.wait_until(lambda: own_endpoints(graph, node) == asleep, what="silence")
+
+
+def own_endpoints(graph: Any, node: str) -> set[str]:
+    """Topics and services of a node in the root namespace."""
+    found = [
+        *graph.node.get_publisher_names_and_types_by_node(node, "/"),
+        *graph.node.get_subscriber_names_and_types_by_node(node, "/"),
+        *graph.node.get_service_names_and_types_by_node(node, "/"),
+        *graph.node.get_client_names_and_types_by_node(node, "/"),
+    ]
+    return {name for name, _ in found}
+
+
+def test_deactivating_amid_messages_ends_no_node(graph: Any) -> None:
+    """An executor may still hold calls that were due before a transition."""
+    live = Live(graph, "/busy", {"sample_period": 0.001}, {"sample_period": 0.001})
+    live.settle()
+    for node in (live.controller_name, live.plant_name) * 10:
+        assert graph.change_state(node, "deactivate")
+        assert graph.change_state(node, "activate")
+    live.settle()
+
+
 def test_a_held_controller_waits_for_its_supervisor(graph: Any) -> None:
     from sensor_msgs.msg import JointState
 
@@ -170,6 +251,34 @@ def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
     assert graph.get_parameters("/b/controller", *names) == values
     graph.wait_for_nodes("/a/controller", "/b/controller")
     assert graph.fact("/b/controller", "parameters") == graph.fact("/a/controller", "parameters")
+
+
+def test_deadline_and_liveliness_of_a_publisher_that_stops_are_counted(graph: Any) -> None:
+    promises = {"deadline": 0.1, "lease": 0.5, "request_deadline": True}
+    live = Live(graph, "/promising", promises, promises)
+    live.settle()
+    facts = [(live.controller_name, "deadline_missed"), (live.controller_name, "publisher_not_alive")]
+    graph.wait_for_nodes(live.controller_name)
+    before = {fact: int(graph.fact(*fact, 0)) for fact in facts}
+    live.plant.send(signal.SIGSTOP)
+    graph.wait_until(lambda: all(int(graph.fact(*fact, 0)) > before[fact] for fact in facts), 30, f"more than {before}")
+    live.plant.send(signal.SIGCONT)
+    live.settle()
+    assert "output: its publisher is not alive any more" in live.controller.log
+    from sensor_msgs.msg import JointState
+
+    graph.node.create_publisher(JointState, f"{live.namespace}/output", 10)  # it promises nothing
+    graph.wait_for_log(live.controller, "requests reliable, volatile, deadline 0.1 s, liveliness lease 0.5 s")
+
+
+def test_processor_and_priority_are_taken_or_the_log_says_how_to_allow_them(graph: Any) -> None:
+    plant = graph.start("plant", mode="realtime", cpu=0, priority=7)
+    controller = graph.start("controller", cpu=4096)
+    graph.wait_for_nodes("/plant", "/controller")
+    assert os.sched_getaffinity(plant.process.pid) == {0}
+    policy = os.sched_getscheduler(plant.process.pid), os.sched_getparam(plant.process.pid).sched_priority
+    assert policy == (os.SCHED_FIFO, 7) or "priority 7 not taken" in plant.log
+    assert "cpu 4096 not taken" in controller.log
 
 
 def test_a_second_publisher_and_a_profile_that_does_not_fit_are_reported(graph: Any) -> None:
