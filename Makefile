@@ -4,10 +4,13 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test lint bench bench-small clean
+.PHONY: demo test report lint bench bench-small clean
 
 demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo
+
+report: $(VENV)/.paper
+	$(BIN)/tdof-npid reproduce --out report
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
@@ -26,6 +29,10 @@ $(VENV)/.run: setup.py
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --editable ".[ros]"
+	touch $@
+
+$(VENV)/.paper: $(VENV)/.run
+	$(BIN)/pip install --quiet --editable ".[ros,paper]"
 	touch $@
 
 $(VENV)/.test: $(VENV)/.run

@@ -13,7 +13,7 @@ from benchmarks.harness import Result, machine, text
 from benchmarks.page import write_page
 
 MODULES = (
-    "loop_speed", "tuning", "lockstep", "live_tuning", "recorder", "reader", "realtime", "startup", "growth",
+    "loop_speed", "tuning", "seeds", "lockstep", "live_tuning", "recorder", "reader", "realtime", "startup", "growth",
 )  # fmt: skip
 
 
