@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test lint bench bench-long bench-small clean
+.PHONY: demo test report lint bench bench-long bench-small clean
 
 demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo

@@ -14,6 +14,7 @@ from tdof_npid_ros.cli import main
 NODES = 3  # of the tuned loop: plant, controller, tuner
 START_TIMEOUT = 60.0  # s
 STOP_TIMEOUT = 30.0  # s
+DOMAINS = 102  # on any machine
 
 
 def children_of(pid: int) -> list[int]:
@@ -36,6 +37,7 @@ def demo(tmp_path: Path) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env={**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % DOMAINS)},
     )
     end = time.monotonic() + START_TIMEOUT
     while len(children_of(program.pid)) < NODES:
