@@ -46,6 +46,7 @@ EXPECTED = {
     "disturbance": "sensor_msgs/msg/JointState",
     "controller_state": "sensor_msgs/msg/JointState",
     "scenario_plan": "trajectory_msgs/msg/JointTrajectory",
+    "/clock": "rosgraph_msgs/msg/Clock",
 }
 
 
