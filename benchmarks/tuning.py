@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import Dots, Result, Table, Verdict, main, summary
+from benchmarks.harness import Dots, Result, Table, Verdict, main, one_process_per_core, summary
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.paper.tables import ROWS
 from tdof_npid_ros.paper.tuned import tuned
@@ -177,7 +174,7 @@ def run(size: str) -> Result:
         for seed in (seeds[: len(seeds) // 2 or 1] if name.startswith("Optuna") else seeds)
     ]
     published = [(row, seed) for row in rows if row in published_rows() for seed in (PUBLISHED_SEEDS if full else seeds)]
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
+    with one_process_per_core() as pool:
         runs = list(pool.map(_one, work, chunksize=4))
         reached = list(pool.map(_reaches_published, published, chunksize=4))
     result = Result()
