@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-
-from benchmarks.harness import Dots, Result, Table, Verdict, main
+from benchmarks.harness import Dots, Result, Table, Verdict, main, one_process_per_core
 from benchmarks.tuning import Row, free_at_published, published_rows
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.paper.tuned import tuned
@@ -38,7 +34,7 @@ def run(size: str) -> Result:
     tenth = 1 if full else 100
     work = [(row, extra, "de", POPULATION, GENERATIONS // tenth) for row, extra in problems]
     work += [(row, extra, "hga", 40, max(2, 200 // tenth)) for row, extra in problems]
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
+    with one_process_per_core() as pool:
         values = list(pool.map(_value, work))
     de, hga = values[: len(problems)], values[len(problems) :]
     known = [None if extra else tuned(*row) for row, extra in problems]  # type: ignore[arg-type]

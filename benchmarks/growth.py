@@ -45,7 +45,7 @@ def run(size: str) -> Result:
         times = [timed(n) for n in sizes]
         exponent = float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
         result.curves.append(Curve(name, unit, [float(n) for n in sizes], times))
-        result.verdicts.append(Verdict(f"exponent of time over {unit}: {name}", exponent, EXPONENT, at_most=True))
+        result.verdicts.append(Verdict(f"{name}: exponent of time", exponent, EXPONENT, at_most=True))
     return result
 
 

@@ -21,8 +21,11 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, cast
 
@@ -164,6 +167,19 @@ def summary(name: str, unit: str, values: Iterable[float], *, note: str = "", ou
     """Median and spread of measured values."""
     values = list(values)
     return Rate(name, unit, statistics.median(values), min(values), max(values), note, ours)
+
+
+@contextmanager
+def one_process_per_core() -> Iterator[ProcessPoolExecutor]:
+    """A pool whose processes keep to one thread each, so that they do not fight for the cores."""
+    before = dict(os.environ)
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # read by the processes when they start
+    try:
+        with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
+            yield pool
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def plural(count: int, noun: str) -> str:

@@ -48,10 +48,10 @@ def run(size: str) -> Result:
         result.rates = rates
         medians = {rate.name: rate.median for rate in rates}
         mine = medians["tdof_npid_ros, columns"]
-        result.verdicts.append(Verdict("against mcap-ros2-support", mine / medians["mcap-ros2-support"], 20))
-        result.verdicts.append(Verdict("against rosbags", mine / medians["rosbags"], 10))
+        result.verdicts.append(Verdict("columns, times mcap-ros2-support", mine / medians["mcap-ros2-support"], 20))
+        result.verdicts.append(Verdict("columns, times rosbags", mine / medians["rosbags"], 10))
         share = peak_memory_share(bag, few)
-        result.verdicts.append(Verdict("growth of peak memory against the columns' size", share, 2, at_most=True))
+        result.verdicts.append(Verdict("peak of the memory taken, times the columns' size", share, 2, at_most=True))
     return result
 
 

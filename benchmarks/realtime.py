@@ -15,7 +15,7 @@ METHOD = (
     "The plant node in realtime mode, in a closed loop with the controller node, at 100 Hz and at 1 kHz: how far its "
     "period is off, by its own diagnostics, and the time from an output to the effort that answers it. Beside it a bare "
     "rclpy node with one steady timer and the fastest executor. Normal scheduling for both; in turn, three times "
-    "ten seconds each."
+    "seven seconds each."
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES: tuple[str, ...] = ()
@@ -28,9 +28,9 @@ TIMEOUT = 60.0  # s
 def run(size: str) -> Result:
     """Both at once would share the processor; so in turn, at each rate."""
     ros_environment(88)
-    seconds, rounds = (10.0, 3) if size == "full" else (2.0, 1)
+    seconds, rounds = (7.0, 3) if size == "full" else (2.0, 1)
     result = Result()
-    for name, period in PERIODS.items():
+    for name, period in list(PERIODS.items())[0 if size == "full" else 1 :]:
         bare: list[dict[str, float]] = []
         ours: list[dict[str, float]] = []
         for _ in range(rounds):
@@ -43,7 +43,7 @@ def run(size: str) -> Result:
             result.rates.append(summary(f"plant node at {name}, {percentile}", "us off", values, ours=True))
         p99 = {rate.name: rate.median for rate in result.rates}
         ratio = p99[f"plant node at {name}, p99"] / p99[f"bare timer at {name}, p99"]
-        result.verdicts.append(Verdict(f"{name}: p99 of the period's error against the bare timer's", ratio, 1.5, at_most=True))
+        result.verdicts.append(Verdict(f"{name}: p99 of the period's error, times the bare timer's", ratio, 1.5, at_most=True))
         steps, missed = (sum(one[figure] for one in ours) for figure in ("steps", "missed_ticks"))
         answer = {p: [one[f"output_to_effort_{p}"] for one in ours] for p in ("p50", "p99")}
         result.notes.append(

@@ -57,10 +57,10 @@ def run(size: str) -> Result:
     node = summary("the controller node until its first answer", "s", controller, ours=True)
     result = Result([help_, numba, fresh, second, bare_node, node])
     result.verdicts += [
-        Verdict("s of tdof-npid --help", help_.median, 0.2, at_most=True),
-        Verdict("s of the first simulate, compilation included", fresh.median, None),
-        Verdict("s of the second simulate", second.median, 1.5, at_most=True),
-        Verdict("s of a node until its first answer beyond a bare one's", node.median - bare_node.median, 1.0, at_most=True),
+        Verdict("tdof-npid --help, s", help_.median, 0.2, at_most=True),
+        Verdict("first simulate, compilation included, s", fresh.median, None),
+        Verdict("second simulate, s", second.median, 1.5, at_most=True),
+        Verdict("node until its first answer, s more than a bare one", node.median - bare_node.median, 1.0, at_most=True),
     ]
     return result
 
@@ -77,7 +77,8 @@ def _call(command: list[str], extra: dict[str, str] | None = None) -> str:
 
 
 def _whole(name: str, command: list[str], repeats: int, extra: dict[str, str] | None = None, ours: bool = False) -> Rate:
-    _call(command, extra)  # warms the disk's cache
+    if repeats > 1:
+        _call(command, extra)  # warms the disk's cache
     return summary(name, "s", [seconds(lambda: _call(command, extra)) for _ in range(repeats)], ours=ours)
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Dots, Result, Table, main
+from benchmarks.harness import Dots, Result, Table, main, one_process_per_core
 from benchmarks.tuning import BUDGET, Counted, Optimise, TargetReachedError, ask_tell, pymoo
 
 TITLE = "The HGA on standard test functions"
@@ -112,7 +109,7 @@ def run(size: str) -> Result:
     functions = list(FUNCTIONS) if full else ["sphere", "Rastrigin"]
     seeds, budget = (SEEDS, BUDGET) if full else (SEEDS[:1], 800)
     work = [(name, function, seed, budget) for function in functions for name in OPTIMISERS for seed in seeds]
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
+    with one_process_per_core() as pool:
         lowest = list(pool.map(_lowest, work, chunksize=4))
     values: dict[tuple[str, str], list[float]] = {}
     for (name, function, _, _), value in zip(work, lowest, strict=True):

@@ -42,9 +42,9 @@ def run(size: str) -> Result:
     labels = [" ".join(row) for row in rows]
     slowest, row = max(zip(times["hga"], labels, strict=True))
     cores = available_cores()
-    result.verdicts.append(Verdict(f"s of a full HGA run on {cores} cores, slowest row ({row})", slowest, LIMIT, at_most=True))
+    result.verdicts.append(Verdict(f"full HGA run on {cores} cores, slowest row ({row}), s", slowest, LIMIT, at_most=True))
     ratio = sum(times["hga"]) / sum(times["de"])
-    result.verdicts.append(Verdict("time of the HGA's runs against SciPy DE's of as many evaluations", ratio, None))
+    result.verdicts.append(Verdict("time of the HGA's runs, times that of SciPy DE's with as many evaluations", ratio, None))
     cells = [[f"{times[a][i]:.2f}" for a in ALGORITHMS] for i in range(len(rows))]
     result.tables.append(
         Table("Wall time of 8,000 evaluations, in s", ["row", *ALGORITHMS.values()],
