@@ -59,6 +59,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", [str(path) for path in Path("config").glob("*.*")]),
+        (f"share/{NAME}/config/sros2", [str(path) for path in Path("config/sros2").glob("*.xml")]),
         (f"share/{NAME}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
     ],
     python_requires=">=3.10",

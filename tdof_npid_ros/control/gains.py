@@ -160,7 +160,7 @@ def check_limits(values: Any, low: str, high: str) -> None:
 def number_of(name: str, value: Any) -> float:
     """A parameter's value as a number; GainsError if it is none, or nan."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
-        raise GainsError(f"{name} is {value!r}: it must be a number")
+        raise GainsError(f"{name} is {value!r}: it must be a number (.inf is infinity)")
     if math.isnan(value):
         raise GainsError(f"{name} is nan: it must be a number")
     return float(value)

@@ -344,7 +344,17 @@ class ControllerNode(LoopNode):
             raise ValueError(
                 f"the gains are for {gains.lanes} lanes, but there are {len(self.joints.names)} joint_names"
             )
+        if gains.lanes != self.controller.lanes and self._answers_live_outputs:
+            raise ValueError(
+                f"the gains are for {gains.lanes} lanes, but the loop that runs has {self.controller.lanes}: "
+                "deactivate the controller first"
+            )
         return gains, operation
+
+    @property
+    def _answers_live_outputs(self) -> bool:
+        """Whether it is in a loop in realtime, whose number of lanes is not ours to change."""
+        return self.active and self.latest_arrival_ns is not None and "/" not in self.effort_for[1] and not self.silent
 
     def _setpoint(self, value: Any) -> np.ndarray:
         one_per_lane = value if isinstance(value, list) else [value]

@@ -50,6 +50,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def __init__(self, name: str) -> None:
         self._activating = False
+        self._defaults: dict[str, Any] = {}
         super().__init__(name)
         self.counts: Counter[str] = Counter()
         self.quiet_parameters: set[str] = set()  # changes of them are not logged: they come from a topic
@@ -60,7 +61,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._refuse_impossible_transitions()
         self._warned: set[str] = set()
         self.autostart = bool(
-            self.declare_value("autostart", True, "activate at once; false: wait for a supervisor's transitions")
+            self.declare_value(
+                "autostart", True, "activate at once; false: wait for a supervisor's transitions", fixed=True
+            )
         )
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer)
@@ -129,6 +132,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def declare_value(self, name: str, default: Any, description: str, *, fixed: bool = False) -> Any:
         """Declare a parameter and return its value. Its type is checked by the node, so that 10 does for 10.0."""
+        self._defaults[name] = default
         descriptor = ParameterDescriptor(description=description, read_only=fixed, dynamic_typing=True)
         return plain(self.declare_parameter(name, default, descriptor).value)
 
@@ -138,12 +142,25 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def accept_changes(self) -> None:
         """From now on, parameters may be changed from outside."""
+        self.add_pre_set_parameters_callback(self._as_declared)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
+
+    def _as_declared(self, parameters: list[Parameter]) -> list[Parameter]:
+        """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send."""
+        return [
+            Parameter(parameter.name, value=as_float(plain(parameter.value)))
+            if isinstance(first(self._defaults.get(parameter.name)), float)
+            else parameter
+            for parameter in parameters
+        ]
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         try:
+            for name, value in changes.items():
+                if name in self._defaults:
+                    check_kind(name, value, self._defaults[name])
             self.checked(changes)
         except (ValueError, TypeError) as error:
             self.counts["refused_parameters"] += 1
@@ -253,6 +270,39 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 def plain(value: Any) -> Any:
     """A parameter's value with arrays as lists."""
     return list(value) if hasattr(value, "__len__") and not isinstance(value, (str, bytes)) else value
+
+
+def first(value: Any) -> Any:
+    """The first element of a list, or the value itself."""
+    return value[0] if isinstance(value, list) and value else value
+
+
+def as_float(value: Any) -> Any:
+    """A whole number, or a word for infinity, as a float, alone or in a list; anything else as it is."""
+    if isinstance(value, list):
+        return [as_float(one) for one in value]
+    if isinstance(value, str) and value.lower().replace(".", "") in ("inf", "+inf", "-inf"):
+        return float(value.replace(".", ""))
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+
+
+def check_kind(name: str, value: Any, default: Any) -> None:
+    """Refuse a value that is of another kind than a parameter's default; a number may become a list, one per lane.
+
+    Raises:
+        ValueError: it is.
+    """
+    kind = type(first(default))
+    if value is None or (isinstance(default, list) and not isinstance(value, list)):
+        raise ValueError(f"{name} is {value!r}: it must be {'a list' if isinstance(default, list) else KINDS[kind]}")
+    if isinstance(value, list) and not isinstance(default, list) and kind is not float:
+        raise ValueError(f"{name} is {value!r}: it must be {KINDS[kind]}")
+    for one in value if isinstance(value, list) else [value]:
+        if type(one) is not kind:
+            raise ValueError(f"{name} is {value!r}: it must be {KINDS[kind]}")
 
 
 def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:

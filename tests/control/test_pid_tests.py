@@ -13,7 +13,7 @@ import pytest
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import Gains, GainsError
+from tdof_npid_ros.control.gains import AntiWindup, Gains, GainsError
 from tdof_npid_ros.control.law import TERMS, tracking_time
 from tdof_npid_ros.control.stamps import Stamps
 
@@ -96,14 +96,22 @@ def test_the_effort_keeps_its_limits_in_both_directions(anti_windup: str) -> Non
     assert min(efforts) == -1.0
 
 
+def test_without_limits_the_effort_is_not_clamped() -> None:
+    errors = [0.5, 1.0, 2.0, 10.0, 50.0, 100.0, -0.5, -1.0, -2.0, -10.0, -50.0, -100.0]
+    assert run(Gains("pid", kp=1.0, anti_windup="none"), errors)[0] == errors
+
+
 def test_integral_clamp_holds_in_both_directions() -> None:
     _, integrals = run(Gains("pid", kp=0.0, ki=1.0, integral_min=-1.0, integral_max=1.0), [-10.0, -10.0, 30.0, 30.0])
     assert integrals == [-1.0, -1.0, 1.0, 1.0]
 
 
-def test_integral_clamp_without_integral_gain() -> None:
-    efforts, integrals = run(Gains("pid", kp=0.0, ki=0.0, integral_min=-1.0, integral_max=1.0), [-1.0, -1.0])
-    assert efforts == integrals == [0.0, 0.0]
+@pytest.mark.parametrize("anti_windup", ["none", "conditional", "back_calculation"])
+def test_without_integral_gain_nothing_is_integrated_or_tracked(anti_windup: AntiWindup) -> None:
+    gains = Gains("pid", kp=0.0, integral_min=-1.0, integral_max=1.0, effort_min=-20.0, effort_max=20.0,
+                  anti_windup=anti_windup)  # fmt: skip
+    efforts, integrals = run(gains, [-1.0, -1.0, -1.0, 10.0, 10.0, 10.0])
+    assert efforts == integrals == [0.0] * 6
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -119,6 +127,24 @@ def test_conditional_integration_stops_only_what_drives_further_into_the_limit()
     assert integrals[:2] == [0.0, 0.0]  # saturated, and the error drives on
     assert integrals[2:] == [1.0, 2.0, 1.5, 1.0]  # at the limit but not beyond it; then back at once
     assert efforts == [2.0, 2.0, 1.0, 2.0, 1.5, 1.0]
+
+
+def test_conditional_integration_through_saturation_and_back() -> None:
+    gains = Gains("pid", kp=0.0, ki=1.0, effort_min=-5.0, effort_max=5.0, anti_windup="conditional")
+    efforts, integrals = run(gains, [1.0, 2.0, 3.0, 1.0, 2.0, -1.0, 0.0])
+    assert efforts == [0.0, 1.0, 3.0, 5.0, 5.0, 5.0, 5.0]
+    assert integrals == [1.0, 3.0, 6.0, 6.0, 6.0, 5.0, 5.0]
+
+
+def test_back_calculation_through_saturation_and_back() -> None:
+    gains = Gains("pid", kp=0.0, ki=1.0, effort_min=-5.0, effort_max=5.0, anti_windup="back_calculation",
+                  tracking_time=1.0)  # fmt: skip
+    errors = [1.0, 2.0, 3.0, 1.0, 2.0, -1.0, 1.0]
+    efforts, integrals = run(gains, errors)
+    assert efforts[:6] == [0.0, 1.0, 3.0, 5.0, 5.0, 5.0] and efforts[6] < 5.0
+    for before, error, after in zip([0.0, *integrals], errors, integrals, strict=False):
+        excess = before - min(before, 5.0)
+        assert after == pytest.approx(before + error - (1.0 - math.exp(-1.0)) * excess)
 
 
 def test_back_calculation_pulls_the_integral_action_towards_the_limit_at_its_tracking_rate() -> None:
@@ -173,6 +199,20 @@ def test_time_that_goes_back_is_not_answered() -> None:
 def test_time_steps_that_are_zero_negative_or_no_number_are_refused(period: object) -> None:
     with pytest.raises(ValueError, match="sample_period"):
         sample_period_in_ns(period)
+
+
+def test_saved_or_forgotten_the_integral_action_is_as_after_their_resets() -> None:
+    controller = Controller(Gains("pid", kp=0.0, ki=1.0), PERIOD_NS)
+    controller.answer(0, np.full(1, 0.5), np.zeros(1))
+    controller.answer(PERIOD_NS, np.zeros(1), np.zeros(1))
+    assert controller.effort[0] == 0.5
+    saved = controller.integral
+    controller.begin_within(np.zeros(1), saved)  # reset(save_i_term=true)
+    controller.answer(2 * PERIOD_NS, np.zeros(1), np.zeros(1))
+    assert controller.effort[0] == 0.5
+    controller.reset()  # reset(save_i_term=false)
+    controller.answer(0, np.zeros(1), np.zeros(1))
+    assert controller.effort[0] == 0.0
 
 
 def test_inputs_of_zero_gains_give_no_effort() -> None:

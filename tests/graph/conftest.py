@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import fcntl
 import itertools
+import math
 import os
 import random
 import signal
@@ -44,6 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOMAINS = range(1, 80)  # used in turn, so that a killed node's remains are gone when its domain comes round again
 START_TIMEOUT = 60.0  # s; generous, for a loaded machine
+ASK_AGAIN = 5.0  # s until a service that may be asked twice is asked again
 REPEAT_PERIOD = 0.1  # s between two times that `publish_until` publishes
 DOMAIN_NUMBERS = itertools.cycle(random.sample(DOMAINS, len(DOMAINS)))
 
@@ -137,6 +139,7 @@ class Graph:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.diagnostics: dict[str, dict[str, Any]] = {}
+        self._clients: dict[str, Any] = {}
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
 
     def close(self) -> None:
@@ -251,15 +254,39 @@ class Graph:
 
         return self.wait_until(published, timeout, what)
 
-    def call(self, service: str, service_type: Any, request: Any = None, timeout: float = START_TIMEOUT) -> Any:
-        client = self.node.create_client(service_type, service)
-        try:
-            self.wait_until(client.service_is_ready, timeout, f"the service {service}")
-            future = client.call_async(request or service_type.Request())
-            self.wait_until(future.done, timeout, f"an answer of {service}")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+    def call(
+        self, service: str, service_type: Any, request: Any = None, timeout: float = START_TIMEOUT, again: bool = False
+    ) -> Any:
+        """The answer of a service.
+
+        Args:
+            again: for what may be asked twice: ask again if no answer comes. An answer is lost if the server has not
+                found its client yet. Clients are found in the order in which they were made; so for what may be asked
+                only once, the node is first asked by a client that is newer.
+        """
+        from lifecycle_msgs.srv import GetAvailableTransitions
+
+        is_new = service not in self._clients
+        if is_new:
+            self._clients[service] = self.node.create_client(service_type, service)
+        client = self._clients[service]
+        if not again:
+            probe = f"{service.rpartition('/')[0]}/get_available_transitions"
+            if is_new and probe in self._clients:
+                self.node.destroy_client(self._clients.pop(probe))
+            self.call(probe, GetAvailableTransitions, again=True)
+        self.wait_until(client.service_is_ready, timeout, f"the service {service}")
+        futures = []
+        next_time = 0.0
+
+        def answered() -> Any:
+            nonlocal next_time
+            if time.monotonic() >= next_time:
+                next_time = time.monotonic() + (ASK_AGAIN if again else math.inf)
+                futures.append(client.call_async(request or service_type.Request()))
+            return next((future for future in futures if future.done()), None)
+
+        return self.wait_until(answered, timeout, f"an answer of {service}").result()
 
     def set_parameters(self, node: str, atomically: bool = False, **values: Any) -> list[Any]:
         """Set parameters of a node; returns the results (`successful`, `reason`), one for all if atomically."""
@@ -270,16 +297,19 @@ class Graph:
         if atomically:
             service = SetParametersAtomically
             return [
-                self.call(f"{node}/set_parameters_atomically", service, service.Request(parameters=parameters)).result
+                self.call(
+                    f"{node}/set_parameters_atomically", service, service.Request(parameters=parameters), again=True
+                ).result
             ]
         request = SetParameters.Request(parameters=parameters)
-        return list(self.call(f"{node}/set_parameters", SetParameters, request).results)
+        return list(self.call(f"{node}/set_parameters", SetParameters, request, again=True).results)
 
     def get_parameters(self, node: str, *names: str) -> list[Any]:
         from rcl_interfaces.srv import GetParameters
         from rclpy.parameter import parameter_value_to_python
 
-        values = self.call(f"{node}/get_parameters", GetParameters, GetParameters.Request(names=list(names))).values
+        request = GetParameters.Request(names=list(names))
+        values = self.call(f"{node}/get_parameters", GetParameters, request, again=True).values
         return [parameter_value_to_python(value) for value in values]
 
     def change_state(self, node: str, transition: str) -> bool:

@@ -247,7 +247,7 @@ def test_random_parameters_of_every_node_are_accepted_or_refused_whole(graph: An
     process = graph.start(node, *arguments)
     name = f"/{node}"
     graph.wait_for_nodes(name)
-    names = list(graph.call(f"{name}/list_parameters", ListParameters).result.names)
+    names = list(graph.call(f"{name}/list_parameters", ListParameters, again=True).result.names)
     rng = random.Random(node)
     wild = [None, True, 0, -7, 2**62, 0.5, -1.0, 1e300, math.nan, -math.inf, "", "x", [b"x", b"y"], [], [True], [0, 1], [1.0],
             [math.nan], ["0 setpoint 1", "1 end"], ["a", ""]]  # fmt: skip

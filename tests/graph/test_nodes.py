@@ -212,6 +212,23 @@ class TestController:
         assert reason in result.reason
         assert loop.get_parameters("/c/controller", *names) == before
 
+    def test_what_the_command_line_sends_is_taken_as_declared(self, loop: Any) -> None:
+        """`ros2 param set` and `load` make 3 of 3.0, and the word inf of .inf."""
+        for sent, taken in ((3, 3.0), ("inf", math.inf), ("-.inf", None), (".INF", math.inf)):
+            (result,) = loop.set_parameters("/c/controller", effort_max=sent)
+            assert result.successful == (taken is not None), result.reason
+            if taken is not None:
+                (value,) = loop.get_parameters("/c/controller", "effort_max")
+                assert type(value) is float and value == taken
+        for name, wrong in (("save_i_term", "x"), ("save_i_term", None), ("kp", None), ("type", 3), ("manual", [True])):
+            (result,) = loop.set_parameters("/c/controller", **{name: wrong})
+            assert not result.successful and f"{name} is {wrong!r}" in result.reason
+
+    def test_lanes_of_a_loop_that_runs_are_not_changed(self, loop: Any) -> None:
+        self.answer(loop, 0.1)
+        (result,) = loop.set_parameters("/c/controller", kp=[1.0, 2.0])
+        assert not result.successful and "the loop that runs has 1" in result.reason
+
     def test_good_parameters_are_logged_old_and_new(self, loop: Any) -> None:
         assert loop.set_parameters("/c/controller", effort_max=50)[0].successful
         loop.wait_for_log(loop.process, "effort_max: inf -> 50")

@@ -241,7 +241,7 @@ def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
     )
     graph.wait_for_nodes("/a/controller")
     assert graph.set_parameters("/a/controller", dead_band=0.25)[0].successful
-    names = list(graph.call("/a/controller/list_parameters", ListParameters).result.names)
+    names = list(graph.call("/a/controller/list_parameters", ListParameters, again=True).result.names)
     values = graph.get_parameters("/a/controller", *names)
     plain = [list(value) if hasattr(value, "__len__") and not isinstance(value, str) else value for value in values]
     file = graph.folder / "dump.yaml"  # as `ros2 param dump /a/controller` writes it
