@@ -15,7 +15,7 @@ MODULES = (
     "loop_speed", "tuning", "tuning_time", "test_functions", "lockstep", "live_tuning", "recorder", "writer",
     "reader", "realtime", "startup", "growth",
 )  # fmt: skip
-LONG = ("best_known", "soak")  # not part of `make bench`: by name, with --only
+LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only
 
 
 def main() -> None:

@@ -49,6 +49,8 @@ class PlantNode(LoopNode):
         self.lossless = self.declare_value(
             "lossless", False, "lockstep: never run ahead of what the recorder has got; needs a recorder", fixed=True
         )
+        names = self.declare_value("joint_names", [""], "name of each lane in output; none: lane0, …", fixed=True)
+        self.joints = [str(name) for name in names if name]
         self.checked({})
         self.accept_changes()
         self.output = signal_message("")
@@ -129,7 +131,7 @@ class PlantNode(LoopNode):
         """Begin again, at the initial state, with the parameters as they are now."""
         lanes = int(self.values_of(["lanes"])["lanes"])
         self.simulator = PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
-        self.output.name = lane_names(lanes)
+        self.output.name = self.joints or lane_names(lanes)
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
@@ -154,6 +156,8 @@ class PlantNode(LoopNode):
             raise ValueError(f"fallback is {p['fallback']!r}: it must be one of {', '.join(FALLBACKS)}")
         if isinstance(p["lanes"], bool) or not isinstance(p["lanes"], int) or not 1 <= p["lanes"] <= 100_000:
             raise ValueError(f"lanes is {p['lanes']!r}: it must be a whole number from 1 to 100000")
+        if self.joints and len(self.joints) != p["lanes"]:
+            raise ValueError(f"joint_names has {len(self.joints)} names, but lanes is {p['lanes']}: give one name per lane")
         if not number("effort_min", p["effort_min"]) <= number("effort_max", p["effort_max"]):
             raise ValueError(
                 f"effort_min is {p['effort_min']} and effort_max {p['effort_max']}: need effort_min <= effort_max"
