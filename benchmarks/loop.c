@@ -4,7 +4,7 @@
    signals are arguments in both. -DPOLYNOMIAL takes the exponential of tdof_npid_ros/control/exponential.py in place of
    the C library's.
 
-   Standard input: steps, runs, delay in samples, phi, gamma_old, gamma_new, eight coefficients of the law, five limits,
+   Standard input: steps, runs, steps until the setpoint goes from 1 to 0 and back, delay in samples, phi, gamma_old, gamma_new, eight coefficients of the law, five limits,
    two limits of the plant. The lanes differ in kp. Prints the best run's steps per second, then the first lane's sum
    of absolute errors. */
 #include <math.h>
@@ -29,11 +29,12 @@ static inline double exp_minus(double q) {
     q = q < 700.0 ? q : 700.0;
     double shifted = fma(q, -1.4426950408889634, 6755399441055744.0), n = shifted - 6755399441055744.0;
     double f = fma(n, -1.90821492927058770002e-10, fma(n, -0.693147180369123816490, -q)), f2 = f * f, f4 = f2 * f2;
-    double low = fma(f4, fma(f2, fma(f, 1 / 5040.0, 1 / 720.0), fma(f, 1 / 120.0, 1 / 24.0)),
-                     fma(f2, fma(f, 1 / 6.0, 0.5), 1 + f));
-    double high = fma(f4, fma(f, 1 / 6227020800.0, 1 / 479001600.0),
-                      fma(f2, fma(f, 1 / 39916800.0, 1 / 3628800.0), fma(f, 1 / 362880.0, 1 / 40320.0)));
-    double mantissa = fma(f4 * f4, high, low);
+    double low = fma(f2, fma(f, 0.16666666666666413, 0.5000000000000011), 1 + f);
+    double middle = fma(f2, fma(f, 0.000198412695067425, 0.0013888888943603685),
+                        fma(f, 0.008333333333494357, 0.041666666666530246));
+    double high = fma(f2, fma(f, 2.500007031530457e-08, 2.7630236589949976e-07),
+                      fma(f, 2.755758628627501e-06, 2.4801493129301335e-05));
+    double mantissa = fma(f4, fma(f4, high, middle), low);
     unsigned long bits, exponent;
     memcpy(&bits, &mantissa, 8);
     memcpy(&exponent, &shifted, 8);
@@ -92,7 +93,7 @@ static double number(void) {
 }
 
 int main(void) {
-    long steps = number(), runs = number(), delay = number();
+    long steps = number(), runs = number(), every = number(), delay = number();
     plant p;
     law c;
     limits m;
@@ -107,7 +108,7 @@ int main(void) {
     for (int i = 0; i < 7; i++) ((double *)&m)[i] = number();
     double *r = malloc((steps + 1) * sizeof *r), *d = calloc(steps + 1, sizeof *d), *w = malloc((steps + 1) * sizeof *w);
     double(*line)[LANES] = malloc((delay + 2) * sizeof *line), best = 1e9, sum = 0;
-    for (long k = 0; k <= steps; k++) r[k] = 1, w[k] = k == 0 || k == steps ? 0.5 : 1.0;
+    for (long k = 0; k <= steps; k++) r[k] = 1 - (k - (k == steps)) / every % 2, w[k] = k == 0 || k == steps ? 0.5 : 1.0;
     for (int i = 0; i < runs; i++) {
         memset(line, 0, (delay + 2) * sizeof *line);
         double start = now();

@@ -23,8 +23,9 @@ from tdof_npid_ros.scenario import Signals, parse_plan
 TITLE = "Closed-loop steps per second"
 METHOD = (
     "One *step* is one sample of controller and plant. The loop is the paper's under TDOF-NPID2 at the published gains, "
-    "a unit step of the setpoint; the call is `loop.integrals`, which the tuner makes. The picture and the peers are "
-    "Process 1 with c = 0.5. C is `benchmarks/loop.c`, -O3 -march=native, compiled for the number of plant states as "
+    "a unit step of the setpoint, back and forth as often as the case's episodes begin (in a loop at rest the C library's "
+    "exponential of next to nothing costs nothing); the call is `loop.integrals`, which the tuner makes. The picture and "
+    "the peers are Process 1 with c = 0.5. C is `benchmarks/loop.c`, -O3 -march=native, compiled for the number of plant states as "
     "Numba compiles ours, one lane, no -ffast-math as ours has none; it is built with the C library's exponential and "
     "with ours, and the faster build counts. python-control runs the whole loop as one discrete `nlsys` through "
     "`input_output_response`, which is several times faster than interconnected systems; bdsim (graphics and progress off) as one clocked state and one function; both step the "
@@ -109,8 +110,10 @@ def _against_c(result: Result, per_case: dict[str, tuple[Rate, Rate, dict[str, R
 
 
 def _signals(case: Case, steps: int) -> Signals:
-    period_ns = case.sample_period_ns
-    return parse_plan(["0 setpoint 1", f"{steps * case.sample_period} end"], period_ns).sampled(period_ns)
+    """A unit step of the setpoint, back after the length of the case's setpoint episode, and so on."""
+    period_ns, every_ns = case.sample_period_ns, case.plans["setpoint"].end_ns
+    changes = [f"{k * every_ns / 1e9} setpoint {1 - k % 2}" for k in range(1 + (steps * period_ns - 1) // every_ns)]
+    return parse_plan([*changes, f"{steps * case.sample_period} end"], period_ns).sampled(period_ns)
 
 
 def _lanes_of(gains: Gains, lanes: int) -> Gains:
@@ -149,7 +152,7 @@ def _c(case: Case, steps: int, repeats: int) -> dict[str, Rate]:
     plant: Any = case.plant.sampled(case.sample_period_ns)
     c, limits = coefficients(case.gains, case.sample_period)
     numbers = [
-        signals.steps, C_RUNS, plant.delay, *np.ravel(plant.phi), *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits,
+        signals.steps, C_RUNS, case.plans["setpoint"].end_ns // case.sample_period_ns, plant.delay, *np.ravel(plant.phi), *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits,
         *UNLIMITED,
     ]  # fmt: skip
     given = " ".join(repr(float(number)) for number in numbers)

@@ -201,8 +201,9 @@ def _run_lane(
         r, d = setpoint[k], disturbance[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        y, u, ring[new], u_i, z = answered(plant, x, u_i, z, c, gain_limits, limits, r, d)
-        x = advance_bounded(plant, x, ring[oldest], ring[due], d)
+        y, u, v, u_i, z = answered(plant, x, u_i, z, c, gain_limits, limits, r, d)
+        ring[new] = v
+        x = advance_bounded(plant, x, ring[oldest], v if plant.delay == 0 else ring[due], d)
         error_sum += weight[k] * abs(r - y)
         if abs(y) < SOUND_OUTPUT:
             sound_outputs += 1.0
