@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from tdof_npid_ros.analysis.errors import AnalysisError
 MOST_COLUMNS = 6
 MOST_LANES = 4  # of an episode
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000")
+_DASHES = ("-", "--", "-.", ":")  # so that curves that coincide are seen
 Named = tuple[str, Episode]
 
 
@@ -34,8 +35,8 @@ def label(name: str, episode: Episode, lane: int, bag: str) -> str:
     return " ".join(part for part in [*parts, bag] if part)
 
 
-def draw(episodes: Sequence[Named], path: Path) -> None:
-    """Write the picture.
+def draw(episodes: Sequence[Named], path: Path, legend: Mapping[str, str]) -> None:
+    """Write the picture; `legend` says how curves of some episodes are called, by the episodes' names.
 
     Raises:
         AnalysisError: the file cannot be written.
@@ -53,8 +54,8 @@ def draw(episodes: Sequence[Named], path: Path) -> None:
             _draw_driving(below, episode.time, episode.disturbance, "disturbance", drawn)
             for lane in range(min(episode.lanes, MOST_LANES)):
                 _draw_driving(above, episode.time, episode.setpoint[:, lane], "setpoint", drawn)
-                style = {"color": _COLOURS[colour % len(_COLOURS)], "lw": 1.3}
-                text = label(name, episode, lane, bags[episode.bag])
+                style = {"color": _COLOURS[colour % len(_COLOURS)], "ls": _DASHES[colour % len(_DASHES)], "lw": 1.3}
+                text = legend.get(name) or label(name, episode, lane, bags[episode.bag])
                 above.plot(episode.time, episode.output[:, lane], label=text, **style)
                 below.plot(episode.time, episode.control_effort[:, lane], drawstyle="steps-post", **style)
                 colour += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -123,13 +123,16 @@ class Report:
         writer.writerows(self.rows())
         return text.getvalue()
 
-    def picture(self, path: str | Path) -> None:
+    def picture(self, path: str | Path, legend: Mapping[str, str] | None = None) -> None:
         """Write setpoint, output and effort of every episode to a PNG (or what the suffix says).
+
+        Args:
+            legend: what curves are called, by the titles of their episodes; the others by controller and number.
 
         Raises:
             AnalysisError: the file cannot be written.
         """
-        picture.draw([(title(report.episode), report.episode) for report in self.episodes], Path(path))
+        picture.draw([(title(report.episode), report.episode) for report in self.episodes], Path(path), legend or {})
 
     def html(self, path: str | Path) -> None:
         """Write one self-contained page with interactive plots.

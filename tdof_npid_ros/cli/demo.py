@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Tune over ROS 2, then run the published and the tuned gains, recorded, and compare."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    from tdof_npid_ros.analysis.report import analyze
+    from tdof_npid_ros.analysis.report import analyze, title
 
     case = load_case(CASE)
     bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -52,7 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
         shutil.copy(result, bag / "tuned.yaml")
     report = analyze([bag])
     picture = bag / "responses.png"
-    report.picture(picture)
+    in_order = [_as_printed(name) for name in rounds for _ in case.plans]
+    report.picture(picture, {title(one.episode): name for one, name in zip(report.episodes, in_order, strict=False)})
     if arguments.json:
         print(json.dumps({"bag": str(bag), "picture": str(picture), "episodes": report.as_json()["episodes"]}))
     else:
@@ -144,6 +145,12 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
 
 
 _REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable
+def _as_printed(name: str) -> str:
+    """A round's name as the paper writes controllers: TDOF-NPID2, tuned."""
+    kind, comma, how = name.partition(",")
+    return kind.replace("_", "-").upper() + comma + how
+
+
 _TUNING_BAR = "{desc} |{bar:30}| generation {n:.0f}/{total:.0f} [{elapsed}]"
 _PLAYING_BAR = "{desc} |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
 
