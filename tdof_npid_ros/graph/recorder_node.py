@@ -28,7 +28,7 @@ from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.messages import set_stamp, signal_message
-from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread
 
@@ -97,7 +97,7 @@ class RecorderNode(LoopNode):
             self.progress = LogProgress([self.resolve_topic_name(name) for name in ("output", "control_effort")])
             self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
         self.thread = TapThread(self._current_taps, self._write)
-        self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=STEADY)
         self.get_logger().info(f"recording to {self.folder}")
         self._look()
 
