@@ -4,10 +4,13 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test lint bench bench-small clean
+.PHONY: demo test report lint bench bench-long bench-small clean
 
 demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo
+
+report: $(VENV)/.paper
+	$(BIN)/tdof-npid reproduce --out report
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
@@ -19,13 +22,22 @@ lint: $(VENV)/.test
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 
+# What takes too long for `make bench`: ten minutes of realtime, ten seeds and 80,000 evaluations a row.
+bench-long: $(VENV)/.bench
+	$(BIN)/python -m benchmarks --only seeds soak
+
+# Whether every benchmark still runs.
 bench-small: $(VENV)/.bench
-	$(BIN)/python -m benchmarks --size small --out $(VENV)/bench-small
+	$(BIN)/python -m benchmarks --size small --all --out $(VENV)/bench-small
 
 $(VENV)/.run: setup.py
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --editable ".[ros]"
+	touch $@
+
+$(VENV)/.paper: $(VENV)/.run
+	$(BIN)/pip install --quiet --editable ".[ros,paper]"
 	touch $@
 
 $(VENV)/.test: $(VENV)/.run

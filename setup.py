@@ -15,7 +15,18 @@ node_scripts = [f"{node} = {NAME}.graph.__main__:{node}" for node in NODES] if b
 
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 PAPER = ["pymoo>=0.6,<0.7", "cma>=4,<5"]
-BENCH = ["control==0.10.2", "simple-pid==2.0.1", "optuna==5.0.0", "pymoo==0.6.2", "cma==4.5.0"]
+BENCH = [
+    "control==0.10.2",
+    "simple-pid==2.0.1",
+    "bdsim==1.4.0",
+    "optuna==5.0.0",
+    "cmaes==0.13.1",
+    "pymoo==0.6.2",
+    "cma==4.5.0",
+    "mcap==1.6.0",
+    "mcap-ros2-support==0.6.0",
+    "rosbags==0.11.9",
+]
 TEST = [
     "pytest>=8",
     "pytest-timeout",

@@ -1,17 +1,23 @@
 """A bare ping-pong of JointState messages between two processes: the limit of any lockstep loop over rclpy.
 
-`python -m benchmarks.ping_pong ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second.
+One message is on its way at a time, as in the loop, and it is as long as the loop's. `python -m benchmarks.ping_pong
+ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second.
 """
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
 from array import array
 
+from benchmarks.harness import last_line
+
 EXECUTORS = ("events", "default")
 DISCOVERY_TIMEOUT = 30.0  # s
+WARM_UP = 500  # round trips
+FRAME_ID = {"ping": "b109e267f7fe/1", "pong": "cf011c08c487 b109e267f7fe/1"}  # as long as the loop's
 
 
 def round_trips_per_second(executor: str, lanes: int, messages: int) -> float:
@@ -22,18 +28,20 @@ def round_trips_per_second(executor: str, lanes: int, messages: int) -> float:
         ping = subprocess.run(
             [*command, "ping", executor, str(lanes), str(messages)], capture_output=True, text=True, check=True
         )
-        return float(ping.stdout)
+        return float(last_line(ping.stdout))
     finally:
-        pong.kill()
+        pong.terminate()  # not killed: it leaves its shared memory in order
         pong.wait()
 
 
 def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     """One of the two processes."""
     import rclpy
-    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
+
+    from tdof_npid_ros.graph.messages import lane_names
 
     rclpy.init()
     node = rclpy.create_node(role)
@@ -45,36 +53,39 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
         executor = SingleThreadedExecutor()
     executor.add_node(node)
     values = array("d", [0.5] * lanes)
-    message = JointState(position=values, effort=values)
-    count = 0
+    message = JointState(name=lane_names(lanes), position=values, effort=values)
+    message.header.frame_id = FRAME_ID[role]
+    stamp = message.header.stamp
     other = "pong" if role == "ping" else "ping"
     publisher = node.create_publisher(JointState, role, QoSProfile(depth=1000))
 
-    def answer(received: JointState) -> None:
-        nonlocal count
-        count += 1
-        if role == "pong" or count < messages:
+    def pong(received: JointState) -> None:
+        message.header.stamp = received.header.stamp
+        publisher.publish(message)
+
+    def ping(received: JointState) -> None:
+        if received.header.stamp.sec == stamp.sec:  # else a repetition from the time of discovery
+            stamp.sec += 1
             publisher.publish(message)
 
-    node.create_subscription(JointState, other, answer, QoSProfile(depth=1000))
+    node.create_subscription(JointState, other, ping if role == "ping" else pong, QoSProfile(depth=1000))
+    if role == "pong":
+        while rclpy.ok():
+            with contextlib.suppress(ExternalShutdownException):
+                executor.spin_once(timeout_sec=0.5)
+        return
     deadline = time.monotonic() + DISCOVERY_TIMEOUT
-    while role == "ping" and not (publisher.get_subscription_count() and node.count_publishers(other)):
+    while stamp.sec == 0:  # until the two have met
         if time.monotonic() > deadline:
             sys.exit("the two processes did not find each other")
-        executor.spin_once(timeout_sec=0.05)
-    if role == "ping":
-        start = time.monotonic()
-        while count == 0:  # the first messages may be lost while the two meet
-            publisher.publish(message)
-            executor.spin_once(timeout_sec=0.2)
-        count, start = 0, time.monotonic()
         publisher.publish(message)
-        while count < messages:
-            executor.spin_once(timeout_sec=0.5)
-        print(messages / (time.monotonic() - start))
-    else:
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
+        executor.spin_once(timeout_sec=0.2)
+    while stamp.sec < WARM_UP:
+        executor.spin_once(timeout_sec=0.5)
+    first, start = stamp.sec, time.monotonic()
+    while stamp.sec < first + messages:
+        executor.spin_once(timeout_sec=0.5)
+    print((stamp.sec - first) / (time.monotonic() - start))
 
 
 if __name__ == "__main__":

@@ -6,98 +6,53 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import Rate, Result, Verdict, main, summary
+from benchmarks.harness import Result, Verdict, main, seconds, summary
+from benchmarks.writer import TOPIC, message, write_ours
 
-QUESTION = "Reading stamp, position and effort of every message of a bag into NumPy arrays; writing as many"
-TOPIC = "/output"
-JOINT_STATE = "sensor_msgs/msg/JointState"
-FOREIGN_MESSAGES = {"small": 1.0, "full": 0.1}  # share of the bag that the slow readers read, for the time it takes
+TITLE = "Reading a bag into columns"
+METHOD = (
+    "Stamp, position and effort of every message of one bag of a million JointState messages, into NumPy arrays. "
+    "`mcap-ros2-support` decodes through its `DecoderFactory` with the `mcap` reader, `rosbags` through its "
+    "`AnyReader`; the row without decoding is the `mcap` reader alone. All read the same bag, in turn."
+)
+PEERS = ("mcap", "mcap-ros2-support", "rosbags")
+NOTES: tuple[str, ...] = ()
 
 
 def run(size: str) -> Result:
     """The readers in turn on the same bag, so that all see the same machine."""
-    messages, rounds = (1_000_000, 3) if size == "full" else (10_000, 1)
-    result = Result(QUESTION)
+    messages, rounds = (1_000_000, 2) if size == "full" else (10_000, 1)
+    result = Result()
     with tempfile.TemporaryDirectory() as folder:
-        bag, part = Path(folder) / "whole", Path(folder) / "part"
-        few = round(messages * FOREIGN_MESSAGES[size])
-        write_bag(bag, map(message, range(messages)))
-        made = [message(step) for step in range(few)]
-        written = [
-            few / _seconds(lambda: write_bag(part, made)),
-            few / _seconds(lambda: write_raw(Path(folder) / "raw.mcap", made)),
-        ]
-        readers: dict[str, tuple[Callable[[Path], np.ndarray], Path, int]] = {
-            "tdof_npid_ros columns": (ours, bag, messages),
-            "mcap-ros2-support": (mcap_ros2, part, few),
-            "rosbags": (rosbags, part, few),
-            "mcap, not decoded": (raw_mcap, part, few),
+        bag, few = Path(folder) / "bag", Path(folder) / "few"
+        write_ours(bag, map(message, range(messages)))
+        write_ours(few, map(message, range(1000)))
+        readers: dict[str, Callable[[Path], np.ndarray]] = {
+            "tdof_npid_ros, columns": ours,
+            "mcap-ros2-support": mcap_ros2,
+            "rosbags": rosbags,
+            "mcap, not decoded": raw_mcap,
         }
-        ours(part)
+        for read in readers.values():  # warm
+            read(few)
         speeds: dict[str, list[float]] = {name: [] for name in readers}
         for _ in range(rounds):
-            for name, (read, path, count) in readers.items():
-                speeds[name].append(count / _seconds(lambda read=read, path=path: read(path)))
-        result.rates = [summary(name, "messages/s", values) for name, values in speeds.items()]
-        result.rates += [Rate("written by tdof_npid_ros", "messages/s", written[0], written[0], written[0])]
-        result.rates += [Rate("written by the mcap package", "messages/s", written[1], written[1], written[1])]
-        rates = {rate.name: rate.median for rate in result.rates}
-        mine = rates["tdof_npid_ros columns"]
-        result.verdicts.append(Verdict("against mcap-ros2-support", mine / rates["mcap-ros2-support"], 20))
-        result.verdicts.append(Verdict("against rosbags", mine / rates["rosbags"], 10))
-        result.verdicts.append(Verdict("writing against the mcap package", written[0] / written[1], 1))
-        share = peak_memory_share(bag)
-        if share > 0:
-            result.verdicts.append(Verdict("peak memory against the columns' size", share, 2, at_most=True))
-        else:
-            result.notes.append("peak memory not shown: it was reached before the columns were read")
+            for name, read in readers.items():
+                speeds[name].append(messages / seconds(lambda read=read: read(bag)))  # type: ignore[misc]
+        rates = [summary(name, "messages/s", speeds[name], ours=read is ours) for name, read in readers.items()]
+        result.rates = rates
+        medians = {rate.name: rate.median for rate in rates}
+        mine = medians["tdof_npid_ros, columns"]
+        result.verdicts.append(Verdict("columns, times mcap-ros2-support", mine / medians["mcap-ros2-support"], 20))
+        result.verdicts.append(Verdict("columns, times rosbags", mine / medians["rosbags"], 10))
+        share = peak_memory_share(bag, few)
+        result.verdicts.append(Verdict("peak of the memory taken, times the columns' size", share, 2, at_most=True))
     return result
-
-
-def message(step: int) -> bytes:
-    """A serialized JointState of one lane, as the plant publishes it."""
-    stamp = step * 5_000_000
-    frame = b"0b723cdfd489/1\0"
-    head = b"\0\1\0\0" + (stamp // 10**9).to_bytes(4, "little") + (stamp % 10**9).to_bytes(4, "little")
-    text = head + len(frame).to_bytes(4, "little") + frame + b"\0" * (-len(frame) % 4)
-    body = bytearray(text + (0).to_bytes(4, "little"))  # no names
-    for values in ((np.sin(step / 100),), (), (np.cos(step / 100),)):
-        body += len(values).to_bytes(4, "little")
-        for value in values:
-            body += b"\0" * (-(len(body) - 4) % 8) + np.float64(value).tobytes()
-    return bytes(body)
-
-
-def write_bag(folder: Path, messages: Iterable[bytes]) -> None:
-    """Write with our writer."""
-    from tdof_npid_ros.bag.writer import BagWriter
-
-    with BagWriter(folder) as writer:
-        topic = writer.add_topic(TOPIC, JOINT_STATE)
-        for step, data in enumerate(messages):
-            writer.write(topic, data, step * 1000, step * 1000, step)
-
-
-def write_raw(path: Path, messages: Iterable[bytes]) -> None:
-    """Write the same with the `mcap` package."""
-    from mcap.writer import CompressionType, Writer
-
-    from tdof_npid_ros.bag.schema import definition
-
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start("ros2")
-        schema = writer.register_schema(JOINT_STATE, "ros2msg", definition(JOINT_STATE).encode())
-        channel = writer.register_channel(TOPIC, "cdr", schema)
-        for step, data in enumerate(messages):
-            writer.add_message(channel, step * 1000, data, step * 1000, step)
-        writer.finish()
 
 
 def ours(bag: Path) -> np.ndarray:
@@ -142,27 +97,32 @@ def raw_mcap(bag: Path) -> np.ndarray:
         return np.array([len(found.data) for _, _, found in make_reader(file).iter_messages()])
 
 
-def peak_memory_share(bag: Path) -> float:
-    """Growth of a fresh process's peak memory while it reads the columns, in sizes of the columns."""
+def peak_memory_share(bag: Path, few: Path) -> float:
+    """Growth of a fresh process's memory, at its peak, while it reads the columns, in sizes of the columns.
+
+    The kernel's peak is set back first (/proc/self/clear_refs): else what the imports took would hide it.
+    """
     program = f"""
-import json, resource
+import json
+from pathlib import Path
 from tdof_npid_ros.bag.reader import BagReader
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-with BagReader({str(bag)!r}) as reader:
-    reader.columns({TOPIC!r}, ["header.stamp.nanosec"]) if reader.topics[{TOPIC!r}].count < 20_000 else None
-    before = peak()
-    columns = reader.columns({TOPIC!r}, ["header.stamp", "position", "effort"])
-    print(json.dumps((peak() - before) / sum(column.nbytes for column in columns.values())))
+
+def read(bag):
+    with BagReader(bag) as reader:
+        return reader.columns({TOPIC!r}, ["header.stamp", "position", "effort"])
+
+def status(name):
+    return int(Path("/proc/self/status").read_text().split(name + ":")[1].split()[0]) * 1024
+
+read({str(few)!r})
+Path("/proc/self/clear_refs").write_text("5")
+before = status("VmRSS")
+columns = read({str(bag)!r})
+print(json.dumps((status("VmHWM") - before) / sum(column.nbytes for column in columns.values())))
 """
     out = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     return float(json.loads(out))
 
 
-def _seconds(function: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
 if __name__ == "__main__":
-    main(run)
+    main("reader")

@@ -10,8 +10,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tdof_npid_ros import loop
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType, Gains, gains_from_mapping
+from tdof_npid_ros.control.gains import (
+    CONTROLLER_TYPES,
+    PER_LANE,
+    ControllerType,
+    Gains,
+    GainsError,
+    gains_from_mapping,
+)
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
@@ -85,7 +94,14 @@ class Case:
         return {name: plan.sampled(self.sample_period_ns) for name, plan in self.plans.items()}
 
     def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
-        """Run an episode in process; gains for one lane or many, by default the case's."""
+        """Run an episode in process; gains for one lane or many, by default the case's.
+
+        Raises:
+            PlanError: the case has no such episode.
+        """
+        if episode not in self.episodes:
+            known = ", ".join(self.episodes) or "none"
+            raise PlanError(f"{self.name} has no episode {episode!r}: its scenario's episodes are {known}")
         gains, signals = gains or self.gains, self.signals[episode]
         if self.operation.is_plain:
             return loop.simulate(self.plant_at, gains, signals, self.effort_limits)
@@ -101,14 +117,38 @@ class Case:
         return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
 
     def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:
-        """Metrics of the episode `setpoint`: a step of the setpoint at its start."""
-        y, signals = self.simulate("setpoint", gains).output[:, 0], self.signals["setpoint"]
-        return setpoint_metrics(y, 0.0, float(signals.setpoint[-1]), self.sample_period)
+        """Metrics of the episode `setpoint`: a step of the setpoint at its start, from 0.
+
+        Raises:
+            PlanError, GainsError: there is no such response; the message says why.
+        """
+        y, setpoint = self._response("setpoint", gains)
+        if setpoint == 0.0:
+            raise PlanError(f"{self.name}, episode 'setpoint': the setpoint stays 0, so there is no step to measure")
+        return setpoint_metrics(y, 0.0, setpoint, self.sample_period)
 
     def disturbance_response(self, gains: Gains | None = None) -> DisturbanceMetrics:
-        """Metrics of the episode `disturbance`: a step of the disturbance at its start, the setpoint held."""
-        y, signals = self.simulate("disturbance", gains).output[:, 0], self.signals["disturbance"]
-        return disturbance_metrics(y, float(signals.setpoint[-1]), self.sample_period)
+        """Metrics of the episode `disturbance`: a step of the disturbance at its start, the setpoint held.
+
+        Raises:
+            PlanError, GainsError: there is no such response; the message says why.
+        """
+        y, setpoint = self._response("disturbance", gains)
+        return disturbance_metrics(y, setpoint, self.sample_period)
+
+    def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float]:
+        """The output (steps + 1,) of an episode of one lane, and the setpoint that it holds from its start on."""
+        lanes = (gains or self.gains).lanes
+        if lanes > 1:
+            raise GainsError(f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each")
+        output = self.simulate(episode, gains).output[:, 0]
+        setpoint = self.signals[episode].setpoint
+        if np.any(setpoint != setpoint[0]):
+            raise PlanError(
+                f"{self.name}, episode {episode!r}: the setpoint changes after 0 s, but the metrics are of one step at 0 s; "
+                "record it and measure every step with 'tdof-npid analyze'"
+            )
+        return output, float(setpoint[0])
 
 
 def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
@@ -150,15 +190,15 @@ def load_case(name: str | Path) -> Case:
             sample_period_ns=sample_period_in_ns(plant.get("sample_period", DEFAULT_SAMPLE_PERIOD)),
             model=str(plant.get("model", "first_order")),
             plant_values=plant,
-            effort_limits=(float(plant.get("effort_min", -math.inf)), float(plant.get("effort_max", math.inf))),
+            effort_limits=_effort_limits(plant),
             gains=gains_from_mapping(controller),
             episodes=read_episodes(scenario),
             bounds=_bounds(tuner),
-            weight=float(tuner.get("weight", 1.0)),
+            weight=_number("weight", tuner.get("weight", 1.0)),
             operation=operation_from_mapping(controller),
         )
         _ = case.plant, case.plans
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
     return case
 
@@ -170,7 +210,7 @@ def find_parameter_file(name: str | Path) -> Path:
         ParameterFileError: there is none.
     """
     path = Path(name)
-    if path.suffix in (".yaml", ".yml") or path.is_file():
+    if path.suffix in (".yaml", ".yml") or path.exists():
         return path
     folder = config_folder()
     found = folder / f"{name}.yaml"
@@ -192,15 +232,32 @@ def read_episodes(scenario: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """The lines of each episode from the scenario's parameters `episodes` and `plan.<episode>`.
 
     Raises:
-        PlanError: an episode has no plan.
+        PlanError: `episodes` is no list of names, or an episode has no plan.
     """
+    names = scenario.get("episodes", [])
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise PlanError(f"episodes is {names!r}: it must be a list of names, as [setpoint, disturbance]")
     episodes = {}
-    for name in scenario.get("episodes", []):
+    for name in names:
         lines = scenario.get(f"plan.{name}")
         if not isinstance(lines, (list, tuple)) or not lines:
             raise PlanError(f"episode {name!r} has no plan: give its lines as the list of strings plan.{name}")
-        episodes[str(name)] = tuple(str(line) for line in lines)
+        episodes[name] = tuple(str(line) for line in lines)
     return episodes
+
+
+def _effort_limits(plant: Mapping[str, Any]) -> tuple[float, float]:
+    low = _number("effort_min", plant.get("effort_min", -math.inf))
+    high = _number("effort_max", plant.get("effort_max", math.inf))
+    if not low <= high:
+        raise ParameterFileError(f"effort_min is {low:g} and effort_max {high:g}: need effort_min <= effort_max")
+    return low, high
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise ParameterFileError(f"{name} is {value!r}: it must be a number")
+    return float(value)
 
 
 def _bounds(tuner: Mapping[str, Any]) -> dict[str, Bounds]:

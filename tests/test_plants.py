@@ -181,3 +181,64 @@ def test_plants_that_cannot_be_built_are_refused_with_the_reason(
 ) -> None:
     with pytest.raises(PlantError, match=word):
         make_plant(model, values)
+
+
+USERS_PLANT = """
+import math
+
+class Tank:
+    parameters = {"area": 2.0}
+    initial_state = (0.0,)
+
+    @staticmethod
+    def derivative(x, u, d, p):
+        return ((u + d) / p[0] - math.sqrt(abs(x[0])),)
+
+    @staticmethod
+    def output(x, p):
+        return x[0]
+"""
+
+
+def users_plant(name: str, text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    return f"{name}:Tank"
+
+
+def test_a_users_plant_has_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = make_plant(users_plant("good_tank", USERS_PLANT, tmp_path, monkeypatch), {"area": 4.0, "substeps": 3})
+    sampled = plant.sampled(10_000_000)
+    assert (sampled.parameters, sampled.substeps) == ((4.0,), 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong", "words"),
+    [
+        ("syntax", "class Tank:", "class Tank(:", "SyntaxError"),
+        ("start", "import math", "import math; no_such_name", "NameError"),
+        ("undefined", "math.sqrt(abs(x[0]))", "no_such_name", "no_such_name"),
+        ("state", "return x[0]", "return x[7]", r"out of range.*state_tank.py"),
+        ("shape", ",)\n\n    @staticmethod\n    def output", ", 0.0)\n\n    @staticmethod\n    def output", "tuple of 1"),
+        ("method", "    @staticmethod\n    def output(x, p)", "    def output(self, x, p)", "static methods"),
+        ("parameters", '{"area": 2.0}', "[2.0]", "map names to finite numbers"),
+        ("value", '{"area": 2.0}', '{"area": "wide"}', "map names to finite numbers"),
+        ("initial", "(0.0,)", "0.0", "initial_state"),
+        ("infinite", "return x[0]", "return x[0] / 0.0", "must be finite"),
+    ],
+)
+def test_a_users_plant_that_cannot_run_is_refused_with_the_reason(
+    name: str, right: str, wrong: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert right in USERS_PLANT
+    model = users_plant(f"{name}_tank", USERS_PLANT.replace(right, wrong, 1), tmp_path, monkeypatch)
+    with pytest.raises(PlantError, match=words) as caught:
+        make_plant(model, {})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("substeps", [0, 1.5])
+def test_substeps_are_a_whole_number(substeps: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = users_plant(f"sub_tank_{int(substeps)}", USERS_PLANT, tmp_path, monkeypatch)
+    with pytest.raises(PlantError, match="whole number"):
+        make_plant(model, {"substeps": substeps})

@@ -1,12 +1,16 @@
 """`tdof-npid simulate` and the parameter files that it shares with the nodes."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.paper.tables import CASES
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
 
 
@@ -36,6 +40,13 @@ def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tm
     assert report["gains"]["kp"] == 1.5  # type: ignore[index]
 
 
+def status_of(arguments: list[str]) -> int:
+    try:
+        return main(arguments)
+    except SystemExit as end:  # argparse ends the program itself
+        return int(str(end.code))
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -45,10 +56,13 @@ def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tm
         ["p1-c4", "--gains", "missing.yaml"],
         ["p1-c4", "--kp", "nan"],
         ["p1-c4", "--sigma", "0"],
+        ["p1-c4", "--sigma", "wide"],
+        ["p1-c4", "--no-such-option"],
+        ["."],
     ],
 )
 def test_bad_input_gets_one_line_and_status_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", *arguments]) == 2
+    assert status_of(["simulate", *arguments]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert len(printed.err.strip().splitlines()) == 1
@@ -67,6 +81,12 @@ def test_bad_input_gets_one_line_and_status_2(arguments: list[str], capsys: pyte
         ("/**/scenario: {ros__parameters: {episodes: [a]}}", "plan.a"),
         ("/**/scenario: {ros__parameters: {episodes: [a], plan: {a: [0 speed 1, 1 end]}}}", "line 1 '0 speed 1'"),
         ("/**/tuner: {ros__parameters: {bounds: {kp: [2, 1]}}}", "bounds.kp"),
+        ("/**/tuner: {ros__parameters: {weight: heavy}}", "weight is 'heavy'"),
+        ("/**/plant: {ros__parameters: {effort_min: low}}", "effort_min is 'low'"),
+        ("/**/plant: {ros__parameters: {effort_min: 5.0, effort_max: 1.0}}", "effort_min <= effort_max"),
+        ("/**/plant: {ros__parameters: {effort_max: .nan}}", "effort_max is nan"),
+        ("/**/scenario: {ros__parameters: {episodes: 3}}", "episodes is 3"),
+        ("/**/scenario: {ros__parameters: {episodes: setpoint}}", "episodes is 'setpoint'"),
     ],
 )
 def test_a_bad_parameter_file_is_refused_with_its_name(text: str, word: str, tmp_path: Path) -> None:
@@ -100,3 +120,78 @@ def test_a_plant_of_the_users_own_runs_from_a_parameter_file(
     )
     report = simulated(capsys, str(file))
     assert report["setpoint"]["settling_time_s"] is not None  # type: ignore[index]
+
+
+LOOP = (
+    "/**/plant: {{ros__parameters: {{model: first_order, dead_time: 0.0}}}}\n"
+    "/**/controller: {{ros__parameters: {{type: pid, kp: {kp}, ki: 1.0}}}}\n"
+    "/**/scenario: {{ros__parameters: {{episodes: [{episodes}], plan: "
+    '{{setpoint: [{setpoint}, "30 end"], disturbance: ["0 disturbance 1", "30 end"]}}}}}}\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"kp": "[1.0, 2.0]"}, "2 lanes"),
+        ({"episodes": ""}, "no episode 'setpoint'"),
+        ({"episodes": "setpoint"}, "no episode 'disturbance'"),
+        ({"setpoint": '"0 setpoint 0"'}, "no step to measure"),
+        ({"setpoint": '"5 setpoint 1"'}, "changes after 0 s"),
+        ({"setpoint": '"0 setpoint 1", "30 setpoint 2"'}, "changes after 0 s"),
+    ],
+)
+def test_metrics_are_told_of_a_single_step_at_the_start_only(
+    changes: dict[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = {"kp": "2.0", "episodes": "setpoint, disturbance", "setpoint": '"0 setpoint 1"'}
+    file = tmp_path / "loop.yaml"
+    file.write_text(LOOP.format(**(values | changes)))
+    assert main(["simulate", str(file)]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert words in printed.err
+    assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("controller", CONTROLLER_TYPES)
+@pytest.mark.parametrize("source", ["published", "tuned"])
+def test_every_case_and_type_prints_the_contract_s_object(
+    case: str, controller: str, source: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["simulate", case, "--controller", controller, "--gains", source, "--json"]
+    if controller == "npid" and source == "published":
+        assert main(arguments) == 2  # the paper has none
+        return
+    assert main(arguments) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert list(report) == ["case", "controller", "gains", "setpoint", "disturbance", "objective"]
+    assert (report["case"], report["controller"]) == (case, controller)
+    assert list(report["gains"]) == ["kp", "ki", "kd", "alpha", "beta", "sigma"]
+    assert list(report["setpoint"])[:3] == ["overshoot_percent", "settling_time_s", "iae"]
+    assert list(report["disturbance"])[:3] == ["peak", "recovery_time_s", "iae"]
+    for response, time in (("setpoint", "settling_time_s"), ("disturbance", "recovery_time_s")):
+        if report[response][time] is None:
+            assert report[response]["reason"]
+
+
+def test_a_reader_that_has_had_enough_gets_no_traceback() -> None:
+    program = subprocess.Popen(
+        [sys.executable, "-m", "tdof_npid_ros", "simulate", "p1-c4"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert program.stdout is not None and program.stderr is not None
+    program.stdout.close()
+    assert program.stderr.read() == b""
+    assert program.wait() != 0
+
+
+def test_without_ros_the_remedy_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    for module in ("replay_node", "conductor"):
+        monkeypatch.delitem(sys.modules, f"tdof_npid_ros.graph.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, "tdof_npid_ros.cli.replay", raising=False)
+    assert main(["replay", str(tmp_path)]) == 2
+    assert "needs ROS 2" in capsys.readouterr().err

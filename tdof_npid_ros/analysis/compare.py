@@ -18,8 +18,16 @@ Key = tuple[str, int]  # episode and stamp in ns
 
 @dataclass(frozen=True)
 class Recorded:
-    """The recorded answers by episode and stamp: digest of the parameters, and effort, (lanes,)."""
+    """What the controller of a recorded loop answered.
 
+    Attributes:
+        namespace: of the loop; ends with a slash.
+        output: the topic that it answered.
+        answers: by episode and stamp: digest of the parameters, and effort, (lanes,).
+    """
+
+    namespace: str
+    output: str
     answers: Mapping[Key, tuple[str, np.ndarray]]
 
     @classmethod
@@ -27,19 +35,25 @@ class Recorded:
         """The answers in a bag.
 
         Raises:
-            BagError: there are none, or the bag is damaged.
+            BagError: there are none, or several controllers', or the bag is damaged.
         """
         loops = [loop for loop in read_loops(reader, bag) if loop.control_effort is not None]
+        recorder_namespace = reader.custom_data.get("namespace", "/").rstrip("/") + "/"
+        loops = [loop for loop in loops if loop.namespace == recorder_namespace] or loops
         if not loops:
             raise BagError(f"{bag}: no control efforts in it to compare with: replay it without compare")
-        return cls({key: answer for loop in loops for key, answer in _answers(loop).items()})
+        if len(loops) > 1:
+            topics = ", ".join(loop.topic for loop in loops)
+            raise BagError(f"{bag}: several loops in it, {topics}: record the one to compare by itself")
+        (loop,) = loops
+        return cls(loop.namespace, loop.topic, _answers(loop))
 
     def key(self, output: bytes) -> Key | None:
         """Episode and stamp of a serialized output, if the recorded controller answered it."""
         order = "<" if output[1] else ">"
         seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", output, 4)
-        episode = output[16 : 16 + max(length - 1, 0)].decode()
-        key = episode, seconds * 1_000_000_000 + nanoseconds
+        frame = output[16 : 16 + max(length - 1, 0)].decode()
+        key = frame if "/" in frame else "", seconds * 1_000_000_000 + nanoseconds  # a robot's frame is no episode
         return key if key in self.answers else None
 
 
@@ -62,11 +76,14 @@ class Comparison:
     failure: str = ""
 
     @property
+    def compared(self) -> int:
+        """Number of answers that were compared."""
+        return self.equal + self.different
+
+    @property
     def sound(self) -> bool:
         """Whether something was compared, and differs only where the parameters do."""
-        return (
-            not self.failure and self.equal + self.different > 0 and (not self.different or bool(self.other_parameters))
-        )
+        return not self.failure and self.compared > 0 and (not self.different or bool(self.other_parameters))
 
     def take(self, recorded: Recorded, key: Key, digest: str, effort: np.ndarray) -> None:
         """Compare one live answer, effort (lanes,)."""
@@ -98,7 +115,7 @@ class Comparison:
     def lines(self) -> list[str]:
         """For people; nothing where nothing was compared."""
         lines = [self.failure] if self.failure else []
-        if self.equal + self.different:
+        if self.compared:
             lines.append(
                 f"{self.equal} control efforts equal bit for bit, {self.different} differ, by {self.largest:g} at most"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,6 +82,16 @@ def read_episodes_of(path: str | Path) -> list[Episode]:
     if not found:
         raise AnalysisError(f"{path}: no episode of at least two outputs in it: record longer")
     return sorted(found, key=lambda episode: episode.start_ns)
+
+
+def bag_names(bags: Iterable[str]) -> dict[str, str]:
+    """For each bag as much of the end of its path as tells it from the others; nothing for a single one."""
+    parts = {bag: Path(bag).resolve().parts for bag in bags}
+    different = len(set(parts.values()))
+    depth = 0
+    while len({path[len(path) - depth :] for path in parts.values()}) < different:
+        depth += 1
+    return {bag: "/".join(path[len(path) - depth :]) for bag, path in parts.items()}
 
 
 def _episodes(loop: Loop) -> Iterator[Episode]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tdof_npid_ros.analysis.episodes import Episode
+from tdof_npid_ros.analysis.episodes import Episode, bag_names
 from tdof_npid_ros.analysis.errors import AnalysisError
 
 MOST_COLUMNS = 6
@@ -25,12 +27,11 @@ def grouped(episodes: Sequence[Named]) -> dict[str, list[Named]]:
     return groups
 
 
-def label(name: str, episode: Episode, lane: int, several_bags: bool) -> str:
-    """How a curve is called in a legend."""
+def label(name: str, episode: Episode, lane: int, bag: str) -> str:
+    """How a curve is called in a legend; `bag` is empty where there is only one."""
     parts = [episode.controller.replace("_", "-").upper(), name.rpartition(" ")[2]]
     parts += [f"lane {lane}"] if episode.lanes > 1 else []
-    parts += [Path(episode.bag).name] if several_bags else []
-    return " ".join(part for part in parts if part)
+    return " ".join(part for part in [*parts, bag] if part)
 
 
 def draw(episodes: Sequence[Named], path: Path) -> None:
@@ -40,36 +41,42 @@ def draw(episodes: Sequence[Named], path: Path) -> None:
         AnalysisError: the file cannot be written.
     """
     groups = list(grouped(episodes).items())[:MOST_COLUMNS]
-    several_bags = len({episode.bag for _, episode in episodes}) > 1
+    bags = bag_names(episode.bag for _, episode in episodes)
     figure = Figure(figsize=(1.5 + 5.5 * len(groups), 6.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(groups), sharex="col", squeeze=False)
     for column, (group, members) in enumerate(groups):
         above, below = axes[0][column], axes[1][column]
-        drawn: set[bytes] = set()
+        drawn: set[bytes] = set()  # what drives, which is often the same in all episodes
         colour = 0
         for name, episode in members:
+            _draw_driving(below, episode.time, episode.disturbance, "disturbance", drawn)
             for lane in range(min(episode.lanes, MOST_LANES)):
-                setpoint = episode.setpoint[:, lane]
-                if setpoint.tobytes() not in drawn:
-                    drawn.add(setpoint.tobytes())
-                    above.plot(
-                        episode.time, setpoint, "--", color="0.4", lw=1, label="setpoint", drawstyle="steps-post"
-                    )
+                _draw_driving(above, episode.time, episode.setpoint[:, lane], "setpoint", drawn)
                 style = {"color": _COLOURS[colour % len(_COLOURS)], "lw": 1.3}
-                above.plot(
-                    episode.time, episode.output[:, lane], label=label(name, episode, lane, several_bags), **style
-                )
+                text = label(name, episode, lane, bags[episode.bag])
+                above.plot(episode.time, episode.output[:, lane], label=text, **style)
                 below.plot(episode.time, episode.control_effort[:, lane], drawstyle="steps-post", **style)
                 colour += 1
         above.set_title(group)
         above.legend(fontsize=8)
+        if below.get_legend_handles_labels()[0]:
+            below.legend(fontsize=8)
         below.set_xlabel("time (s)")
         for axis in (above, below):
             axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("setpoint r, output y")
-    axes[1][0].set_ylabel("control effort u")
+    axes[1][0].set_ylabel("control effort u, disturbance d")
     try:
         figure.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
         raise AnalysisError(f"{path} cannot be written: {error}") from None
+
+
+def _draw_driving(axis: Axes, time: np.ndarray, values: np.ndarray, name: str, drawn: set[bytes]) -> None:
+    """Draw a setpoint or disturbance, dashed, unless it is there already, or a disturbance that is none."""
+    content = values.tobytes()
+    if content in drawn or (name == "disturbance" and not values.any()):
+        return
+    drawn.add(content)
+    axis.plot(time, values, "--", color="0.4", lw=1, label=name, drawstyle="steps-post")

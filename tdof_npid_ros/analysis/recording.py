@@ -62,6 +62,7 @@ class Loop:
     Attributes:
         bag: its path, for messages.
         namespace: ends with a slash.
+        topic: the output's.
         output: what is controlled; `effort` the effort really applied.
         control_effort: the controller's answers; None in a bag without.
         disturbance, setpoint: as published live; None in a bag without.
@@ -71,6 +72,7 @@ class Loop:
 
     bag: str
     namespace: str
+    topic: str
     output: Signal
     control_effort: Signal | None
     setpoint: Signal | None
@@ -109,6 +111,7 @@ def read_loops(reader: BagReader, bag: str) -> list[Loop]:
         Loop(
             bag,
             namespace,
+            topic,
             _signal(reader, topic),
             _signal_if_there(reader, f"{namespace}control_effort"),
             _signal_if_there(reader, f"{namespace}setpoint"),

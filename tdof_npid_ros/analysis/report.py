@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.analysis import page, picture
-from tdof_npid_ros.analysis.episodes import Episode, read_episodes_of
+from tdof_npid_ros.analysis.episodes import Episode, bag_names, read_episodes_of
 from tdof_npid_ros.analysis.responses import Deviation, EffortUse, Response, deviation, effort_use, responses
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
 
@@ -65,8 +65,8 @@ class Report:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per response, by the names of `COLUMNS`; None where there is no such number."""
-        several_bags = len({report.episode.bag for report in self.episodes}) > 1
-        rows = [row for report in self.episodes for row in _rows(report, several_bags)]
+        names = bag_names(report.episode.bag for report in self.episodes)
+        rows = [row for report in self.episodes for row in _rows(report, names[report.episode.bag])]
         first: dict[tuple[Any, ...], float] = {}
         for row in rows:
             same = (row["episode"].partition(" #")[0], row["lane"], row["response"], row["start_s"])
@@ -79,18 +79,23 @@ class Report:
 
     def table(self) -> str:
         """The rows as a table for a terminal; columns without a value are left out."""
+        cells, left_out = self._cells()
+        widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+        lines.insert(1, "  ".join("─" * width for width in widths))
+        if left_out:
+            lines.append(f"… {left_out} rows of further lanes: --csv or --json has them")
+        return "\n".join([*lines, *self.notes()])
+
+    def _cells(self) -> tuple[list[list[str]], int]:
+        """The table for people, titles first, without columns that say nothing; and how many rows it leaves out."""
         rows = self.rows()
         shown = [row for row in rows if row["lane"] < LANES_SHOWN]
         names = [name for name in COLUMNS if any(row[name] not in (None, "") for row in shown)]
         if all(row["lane"] == 0 for row in rows):
             names.remove("lane")
-        cells = [[COLUMNS[name][0] for name in names], *([_shown(row, name) for name in names] for row in shown)]
-        widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
-        lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
-        lines.insert(1, "  ".join("─" * width for width in widths))
-        if len(shown) < len(rows):
-            lines.append(f"… {len(rows) - len(shown)} rows of further lanes: --csv or --json has them")
-        return "\n".join([*lines, *self.notes()])
+        titles = [COLUMNS[name][0] for name in names]
+        return [titles, *([_shown(row, name) for name in names] for row in shown)], len(rows) - len(shown)
 
     def notes(self) -> list[str]:
         """Why numbers are missing, a line for each cause."""
@@ -106,7 +111,8 @@ class Report:
 
     def as_json(self) -> dict[str, Any]:
         """The whole report as a JSON object; limits that are infinite become null."""
-        document: dict[str, Any] = _finite({"episodes": [_as_json(report) for report in self.episodes]})
+        changes = iter([row["iae_change_percent"] for row in self.rows()])
+        document: dict[str, Any] = _finite({"episodes": [_as_json(report, changes) for report in self.episodes]})
         return document
 
     def as_csv(self) -> str:
@@ -131,10 +137,8 @@ class Report:
         Raises:
             AnalysisError: the file cannot be written.
         """
-        rows = [[_shown(row, name) for name in COLUMNS] for row in self.rows() if row["lane"] < LANES_SHOWN]
-        titles = [heading for heading, _ in COLUMNS.values()]
         named = [(title(report.episode), report.episode) for report in self.episodes]
-        page.write(named, [titles, *rows], self.notes(), Path(path))
+        page.write(named, self._cells()[0], self.notes(), Path(path))
 
 
 def analyze(paths: Iterable[str | Path]) -> Report:
@@ -162,13 +166,13 @@ def _report(episode: Episode) -> EpisodeReport:
     )
 
 
-def _rows(report: EpisodeReport, several_bags: bool) -> list[dict[str, Any]]:
+def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:
     episode, off = report.episode, report.deviation
     rows = []
     for lane, (found, use) in enumerate(zip(report.responses, report.effort, strict=True)):
         for response in found:
             values: dict[str, Any] = dict.fromkeys(COLUMNS)
-            values |= {"bag": Path(episode.bag).name if several_bags else "", "episode": title(episode)}
+            values |= {"bag": bag, "episode": title(episode)}
             values |= {"controller": episode.controller, "lane": lane, "response": response.kind}
             values |= {"start_s": response.start_s, "iae": response.iae}
             metrics = asdict(response.metrics) if response.metrics is not None else {}
@@ -186,7 +190,7 @@ def _shown(row: dict[str, Any], name: str) -> str:
     return "-" if row[name] is None else COLUMNS[name][1].format(row[name])
 
 
-def _as_json(report: EpisodeReport) -> dict[str, Any]:
+def _as_json(report: EpisodeReport, iae_changes: Iterator[float | None]) -> dict[str, Any]:
     episode = report.episode
     return {
         "bag": episode.bag,
@@ -200,16 +204,19 @@ def _as_json(report: EpisodeReport) -> dict[str, Any]:
         "samples": len(episode.time),
         "missing": episode.missing,
         "lanes": [
-            {"responses": [_response_as_json(response) for response in found], "effort": asdict(use)}
+            {
+                "responses": [_response_as_json(response, next(iae_changes)) for response in found],
+                "effort": asdict(use),
+            }
             for found, use in zip(report.responses, report.effort, strict=True)
         ],
         "deviation": asdict(report.deviation),
     }
 
 
-def _response_as_json(response: Response) -> dict[str, Any]:
+def _response_as_json(response: Response, iae_change: float | None) -> dict[str, Any]:
     document = asdict(response)
-    return document | (document.pop("metrics") or {})
+    return document | (document.pop("metrics") or {}) | {"iae_change_percent": iae_change}
 
 
 def _finite(value: Any) -> Any:

@@ -48,8 +48,7 @@ class CdrCursor:
             raise BagError(f"{where}: a message of {len(self._data)} bytes has no CDR head: it is damaged")
         if self._data[0] != 0 or self._data[1] not in BYTE_ORDERS:
             raise BagError(
-                f"{where}: CDR encoding {self._data[0]:02x}{self._data[1]:02x} is not supported: record"
-                " plain CDR"
+                f"{where}: CDR encoding {self._data[0]:02x}{self._data[1]:02x} is not supported: record plain CDR"
             )
         self.order: Order = BYTE_ORDERS[self._data[1]]
 
@@ -86,18 +85,14 @@ class CdrCursor:
         """Take note of strings, sequences and nested messages, of which one message may hold a million."""
         self._parts += count
         if self._parts > _MAX_PARTS:
-            raise BagError(
-                f"{self._where}: more than {_MAX_PARTS} strings and arrays in one message: leave it out"
-            )
+            raise BagError(f"{self._where}: more than {_MAX_PARTS} strings and arrays in one message: leave it out")
 
     def string(self) -> tuple[int, int]:
         """Go beyond the next string and return where it begins and its bytes, the closing zero included."""
         size = self.length(1)
         start = self.skip(size)
         if size and self._data[start + size - 1] != 0:
-            raise BagError(
-                f"{self._where}: a string at byte {start} has no closing zero: the message is damaged"
-            )
+            raise BagError(f"{self._where}: a string at byte {start} has no closing zero: the message is damaged")
         return start, size
 
     def text(self) -> str:
@@ -106,9 +101,7 @@ class CdrCursor:
         try:
             return str(self._data[start : start + max(size - 1, 0)], "utf-8")
         except UnicodeDecodeError:
-            raise BagError(
-                f"{self._where}: a string at byte {start} is not UTF-8: the message is damaged"
-            ) from None
+            raise BagError(f"{self._where}: a string at byte {start} is not UTF-8: the message is damaged") from None
 
     def numbers(self, primitive: str, count: int) -> NDArray[Any]:
         """Return the next `count` numbers in this machine's byte order."""

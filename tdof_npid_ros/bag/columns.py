@@ -47,9 +47,7 @@ class Layout(NamedTuple):
 
     def matches(self, rows: _Rows) -> NDArray[np.bool_]:
         """Tell which rows, shape (messages, width), have this layout."""
-        same: NDArray[np.bool_] = (rows[:, _ROW_SHIFT] == 0) & (
-            rows[:, _ROW_SHIFT + 1] == (self.order == "<")
-        )
+        same: NDArray[np.bool_] = (rows[:, _ROW_SHIFT] == 0) & (rows[:, _ROW_SHIFT + 1] == (self.order == "<"))
         if self.length_words.size:
             words = rows.view(f"{self.order}u4")[:, self.length_words]
             same &= (words == self.lengths).all(axis=1)
@@ -80,9 +78,7 @@ def _decode_texts(raw: NDArray[np.uint8], where: str) -> Column:
             if text not in decoded:
                 decoded[text] = text.decode()
     except UnicodeDecodeError:
-        raise BagError(
-            f"{where}: a string is not UTF-8: the bag is damaged, run `tdof-npid recover`"
-        ) from None
+        raise BagError(f"{where}: a string is not UTF-8: the bag is damaged, run `tdof-npid recover`") from None
     return np.array([decoded[text] for text in joined])
 
 
@@ -92,9 +88,7 @@ def _text_extractor(start: int, size: int, where: str) -> _Extract:
 
     def extract(rows: _Rows) -> Column:
         if size and rows[:, last].any():
-            raise BagError(
-                f"{where}: a string has no closing zero: the bag is damaged, run `tdof-npid recover`"
-            )
+            raise BagError(f"{where}: a string has no closing zero: the bag is damaged, run `tdof-npid recover`")
         return _decode_texts(rows[:, first:last], where)
 
     return extract
@@ -129,9 +123,7 @@ def _stamp_extractor(seconds: _Extract, nanoseconds: _Extract) -> _Extract:
 class _LayoutWalker:
     """Walks one message and notes where its fields lie."""
 
-    def __init__(
-        self, definition: Definition, wanted: frozenset[str], message: memoryview, where: str
-    ) -> None:
+    def __init__(self, definition: Definition, wanted: frozenset[str], message: memoryview, where: str) -> None:
         self._definition = definition
         self._wanted = wanted
         self._size = len(message)
@@ -141,9 +133,7 @@ class _LayoutWalker:
     def layout(self) -> Layout:
         """Return the message's layout."""
         extractors = tuple(
-            (path, extract)
-            for path, extract in self._message(self._definition.root, "")
-            if path in self._wanted
+            (path, extract) for path, extract in self._message(self._definition.root, "") if path in self._wanted
         )
         positions = np.array([position for position, _ in self._cursor.lengths], np.int64)
         lengths = np.array([value for _, value in self._cursor.lengths], np.uint32)
@@ -226,9 +216,7 @@ class _Gathered:
 class ColumnBuilder:
     """Gathers a topic's messages, piece after piece, into columns."""
 
-    def __init__(
-        self, definition: Definition, fields: Sequence[str] | None, where: str, expected: int = 0
-    ) -> None:
+    def __init__(self, definition: Definition, fields: Sequence[str] | None, where: str, expected: int = 0) -> None:
         """Prepare to decode `fields` (flattened paths), by default all, of `expected` messages.
 
         Raises
@@ -270,9 +258,7 @@ class ColumnBuilder:
         for size in np.unique(table.length):
             which = table.length == size
             if size < HEAD_BYTES:
-                raise BagError(
-                    f"{self._where}: a message of {size} bytes has no CDR head: the bag is damaged"
-                )
+                raise BagError(f"{self._where}: a message of {size} bytes has no CDR head: the bag is damaged")
             self._add_rows(rows[which], scan.gather(table.data, table.offset[which], int(size)), int(size))
 
     def finish(self) -> Columns:

@@ -13,9 +13,7 @@ from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.bag.records import ChunkHead
 from tdof_npid_ros.bag.scan import Bytes
 
-MAX_CHUNK_BYTES: Final = (
-    256 << 20
-)  # recorders write chunks of a few MiB; no chunk may take more memory than this
+MAX_CHUNK_BYTES: Final = 256 << 20  # recorders write chunks of a few MiB; no chunk may take more memory than this
 
 _MAX_WINDOW_BYTES: Final = 128 << 20
 _LZ4_STEP_BYTES: Final = 8 << 20
@@ -81,8 +79,7 @@ def decompress(head: ChunkHead, data: bytes, where: str) -> Bytes:
             ) from None
     else:
         raise BagError(
-            f"{where}: compression {head.compression[:20]!r} is unknown: rewrite the bag with zstd, lz4 or"
-            " none"
+            f"{where}: compression {head.compression[:20]!r} is unknown: rewrite the bag with zstd, lz4 or none"
         )
     if not whole:
         raise BagError(

@@ -73,9 +73,7 @@ class Definition:
         for path in self._paths(self.root, ""):
             found.append(path)
             if len(found) > MAX_FIELDS:
-                raise BagError(
-                    f"type {self.root}: more than {MAX_FIELDS} fields: read its messages with `decode`"
-                )
+                raise BagError(f"type {self.root}: more than {MAX_FIELDS} fields: read its messages with `decode`")
         return found
 
     def _paths(self, type_name: str, prefix: str) -> Iterator[str]:
@@ -130,8 +128,7 @@ def _parse_fields(text: str, type_name: str) -> tuple[Field, ...]:
 
 
 def _least_sizes(root: str, types: Mapping[str, tuple[Field, ...]]) -> dict[str, int]:
-    """Return the least size of each type in use, and so find out whether all are there and none holds"
-    " itself."""
+    """Return the least size of each type in use, and so find out whether all are there and none holds itself."""
     least: dict[str, int] = {name: int(code[1]) for name, code in PRIMITIVES.items()}
     least[STRING] = 4
 
@@ -139,9 +136,7 @@ def _least_sizes(root: str, types: Mapping[str, tuple[Field, ...]]) -> dict[str,
         if name in least:
             return least[name]
         if name in path or len(path) > _MAX_DEPTH:
-            raise BagError(
-                f"type {root}: {name} contains itself or is nested too deeply: the definition is damaged"
-            )
+            raise BagError(f"type {root}: {name} contains itself or is nested too deeply: the definition is damaged")
         if name not in types:
             raise BagError(f"type {root}: the definition of {name} is missing in the bag: record it again")
         size = 0

@@ -29,6 +29,7 @@ _CRC_FILE_BYTES: Final = 256 << 20  # the checksum over all data is verified in 
 _MAX_DEFINITIONS_BYTES: Final = 64 << 20
 _LEAST_MESSAGE_BYTES: Final = records.PREFIX_BYTES + records.MESSAGE_FIELDS_BYTES
 _MAX_METADATA_BYTES: Final = 16 << 20
+_MAX_DEFINITIONS: Final = 2 * 2**16  # in one chunk: every schema and every channel that there can be
 
 _DATA_OPCODES: Final = frozenset(range(records.SCHEMA, records.DATA_END + 1))
 
@@ -37,6 +38,7 @@ _STOPS: Final = {
     scan.CUT_SHORT: "is longer than what holds it",
     scan.WRONG_LENGTH: "is a message too short for its own fields",
     scan.WRONG_TIME: "bears a time beyond the year 2262",
+    scan.TOO_MANY: "is the first of more definitions than any bag needs",
 }
 
 
@@ -119,7 +121,7 @@ class McapFile:
         if len(data) < span.size:
             raise BagError(f"{where}: the file has become shorter since it was opened: open it again")
         content = decompress(span.head, data, where) if span.head else np.frombuffer(data, np.uint8)
-        walk = scan.walk(content)
+        walk = scan.walk(content, _MAX_DEFINITIONS)
         if walk.stop != scan.AT_END:
             raise BagError(f"{where}: the record at byte {walk.position} {_STOPS[walk.stop]}: {_DAMAGED}")
         for position in walk.others.tolist():
@@ -177,8 +179,7 @@ class McapFile:
         self.dropped_bytes += size
 
     def _walk(self) -> int:
-        """Find the pieces; return where the data section ends, or the last whole record of an unfinished"
-        " file."""
+        """Find the pieces; return where the data section ends, or the last whole record of an unfinished file."""
         position = len(records.MAGIC)
         while True:
             head = self._read(position, _HEAD_BYTES)
@@ -244,13 +245,13 @@ class McapFile:
             check_size(size, where)
             data = np.frombuffer(self._read(position, size), np.uint8)
             size, stop = scan.run_length(data)
-        walk = scan.walk(data[:size])
+        walk = scan.walk(data[:size], 0)
         if stop == scan.WRONG_LENGTH or walk.stop == scan.WRONG_TIME:
             at = position + (walk.position if walk.stop else size)
             if not self._salvage:
                 raise BagError(f"{self._where('record', at)}: {_STOPS[walk.stop or stop]}: {_DAMAGED}")
             size = walk.position
-            walk = scan.walk(data[:size])
+            walk = scan.walk(data[:size], 0)
         if size:
             times = walk.table.log_time
             self._spans.append(_Span(position, size, None, int(times.min()), int(times.max())))
@@ -316,7 +317,7 @@ class McapFile:
         summary = self._read(start, footer_at - start)
         if crc and zlib.crc32(footer[:-4], zlib.crc32(summary)) != crc:
             raise BagError(f"{where}: its checksum is wrong: {_DAMAGED}")
-        walk = scan.walk(np.frombuffer(summary, np.uint8))
+        walk = scan.walk(np.frombuffer(summary, np.uint8), len(summary))
         if walk.stop != scan.AT_END or walk.table.offset.size:
             raise BagError(f"{where}: its records do not end where it ends: {_DAMAGED}")
         for position in walk.others.tolist():

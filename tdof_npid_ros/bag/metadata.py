@@ -22,8 +22,7 @@ _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
 
 @dataclass(frozen=True)
 class QosProfile:
-    """The quality of service that a publisher offers, in rosbag2's words. Deadline and lifespan are"
-    " infinite."""
+    """The quality of service that a publisher offers, in rosbag2's words. Deadline and lifespan are infinite."""
 
     reliability: str = "reliable"  # reliable, best_effort
     durability: str = "volatile"  # volatile, transient_local

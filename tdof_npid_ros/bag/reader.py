@@ -27,9 +27,8 @@ Message = tuple[str, int, int, memoryview]  # topic, log time, publish time, CDR
 
 LAST_NS: Final = 2**63 - 1
 
-_MAX_OPEN_BYTES: Final = (
-    1 << 30
-)  # of pieces that overlap in time, read at once to put their messages in order
+_MAX_OPEN_BYTES: Final = 1 << 30  # of pieces that overlap in time, read at once to put their messages in order
+_ROWS_AT_ONCE: Final = 1 << 14  # of a piece, as Python objects
 _SUFFIXES: Final = (".mcap", ".db3")
 
 
@@ -49,9 +48,7 @@ def bag_files(path: Path) -> list[Path]:
         raise BagError(f"cannot open {path}: {error.strerror}: give a bag folder or a file") from None
     if not files:
         raise BagError(f"{path}: no .mcap or .db3 file in it: give a bag folder or a file")
-    return sorted(
-        files, key=lambda file: [int(part) if part.isdigit() else part for part in _split_digits(file.name)]
-    )
+    return sorted(files, key=lambda file: [int(part) if part.isdigit() else part for part in _split_digits(file.name)])
 
 
 def _split_digits(name: str) -> list[str]:
@@ -182,8 +179,7 @@ class BagReader:
         * an array of numbers, of the same length m in all messages: shape (n, m);
         * a string: shape (n,), NumPy `str`; an array of m strings: shape (n, m);
         * anything else, that is arrays whose lengths vary, arrays of messages (as lists of dicts), and
-        strings of
-          very different lengths: shape (n,), objects.
+          strings of very different lengths: shape (n,), objects.
 
         Raises
         ------
@@ -198,9 +194,7 @@ class BagReader:
                     self._add_columns(builder, file, topic, limit)
             return builder.finish()
         except MemoryError:
-            raise BagError(
-                f"topic {topic}: its columns need more memory than there is: read fewer fields"
-            ) from None
+            raise BagError(f"topic {topic}: its columns need more memory than there is: read fewer fields") from None
 
     def decode(self, topic: str, data: bytes | bytearray | memoryview) -> dict[str, Any]:
         """Return one message of a topic as a dict; see `cdr.decode`.
@@ -219,9 +213,7 @@ class BagReader:
             information = metadata.read_information(path)
             mode = information.get("compression_mode")
             if mode and str(mode).upper() != "NONE":
-                raise BagError(
-                    f"{path}: is compressed by rosbag2 ({mode}): unpack it with `ros2 bag convert`"
-                )
+                raise BagError(f"{path}: is compressed by rosbag2 ({mode}): unpack it with `ros2 bag convert`")
             custom = information.get("custom_data")
             if isinstance(custom, dict):
                 self.custom_data.update({str(key): str(value) for key, value in custom.items()})
@@ -234,16 +226,13 @@ class BagReader:
                 known = self.topics.setdefault(topic.name, replace(topic, count=0))
                 if known.type != topic.type:
                     raise BagError(
-                        f"{name}: topic {topic.name} is of type {topic.type}, elsewhere {known.type}: read"
-                        " them apart"
+                        f"{name}: topic {topic.name} is of type {topic.type}, elsewhere {known.type}: read them apart"
                     )
                 self.topics[topic.name] = replace(known, count=known.count + topic.count)
 
     def _topic(self, topic: str) -> TopicInfo:
         if topic not in self.topics:
-            raise BagError(
-                f"no topic {topic!r} in the bag: choose from {', '.join(sorted(self.topics)) or 'none'}"
-            )
+            raise BagError(f"no topic {topic!r} in the bag: choose from {', '.join(sorted(self.topics)) or 'none'}")
         return self.topics[topic]
 
     def _definition(self, topic: str) -> Definition:
@@ -261,9 +250,7 @@ class BagReader:
                 )
             definition = parse(info.type, info.definition)
             if agreed is not None and definition.types != agreed.types:
-                raise BagError(
-                    f"{file.name}: topic {topic} has other fields than in the files before: read them apart"
-                )
+                raise BagError(f"{file.name}: topic {topic} has other fields than in the files before: read them apart")
             agreed = definition
         assert agreed is not None
         return agreed
@@ -289,8 +276,7 @@ class BagReader:
 
 
 def _free_memory_bytes() -> int:
-    """Return how much columns may take: what the system has left, as half of it may be needed to join"
-    " them."""
+    """Return how much columns may take: half of what the system has left, as joining them may need the other half."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -300,9 +286,7 @@ def _free_memory_bytes() -> int:
     return 2**63
 
 
-def _rows(
-    table: Table, file: Storage, wanted: frozenset[str], start_ns: int, stop_ns: int
-) -> Iterator[Message]:
+def _rows(table: Table, file: Storage, wanted: frozenset[str], start_ns: int, stop_ns: int) -> Iterator[Message]:
     """Yield the wanted messages of a table in log-time order."""
     times = table.log_time
     names = file.topic_of
@@ -315,15 +299,17 @@ def _rows(
     if (table.log_time[1:] < table.log_time[:-1]).any():
         table = table.only(np.argsort(table.log_time, kind="stable"))
     data = table.data.data.toreadonly()
-    for channel, log_time, publish_time, offset, length in zip(
-        table.channel.tolist(),
-        table.log_time.tolist(),
-        table.publish_time.tolist(),
-        table.offset.tolist(),
-        table.length.tolist(),
-        strict=True,
-    ):
-        yield names[channel], log_time, publish_time, data[offset : offset + length]
+    for first in range(0, table.length.size, _ROWS_AT_ONCE):
+        block = table.only(slice(first, first + _ROWS_AT_ONCE))
+        for channel, log_time, publish_time, offset, length in zip(
+            block.channel.tolist(),
+            block.log_time.tolist(),
+            block.publish_time.tolist(),
+            block.offset.tolist(),
+            block.length.tolist(),
+            strict=True,
+        ):
+            yield names[channel], log_time, publish_time, data[offset : offset + length]
 
 
 def _merge(

@@ -1,5 +1,4 @@
-"""MCAP records as bytes: packing and bounded unpacking (https://mcap.dev/spec). All integers"
-" little-endian."""
+"""MCAP records as bytes: packing and bounded unpacking (https://mcap.dev/spec). All integers little-endian."""
 
 from __future__ import annotations
 
@@ -122,9 +121,7 @@ def metadata_record(name: str, values: Mapping[str, str]) -> bytes:
     return record(METADATA, text(name) + _text_map(values))
 
 
-def chunk_head(
-    start_ns: int, end_ns: int, uncompressed_size: int, crc: int, compression: str, data_size: int
-) -> bytes:
+def chunk_head(start_ns: int, end_ns: int, uncompressed_size: int, crc: int, compression: str, data_size: int) -> bytes:
     """Return what stands before a chunk's data, the record's prefix included."""
     head = chunk_times.pack(start_ns, end_ns, uncompressed_size, crc) + text(compression)
     head += struct.pack("<Q", data_size)
@@ -136,9 +133,7 @@ def message_index_record(channel_id: int, entries: bytes) -> bytes:
     return record(MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
 
 
-def statistics_record(
-    statistics: Statistics, schema_count: int, channel_count: int, metadata_count: int
-) -> bytes:
+def statistics_record(statistics: Statistics, schema_count: int, channel_count: int, metadata_count: int) -> bytes:
     """Return a file's statistics as a record."""
     fields = statistics_fields.pack(
         statistics.message_count,

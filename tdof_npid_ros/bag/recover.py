@@ -1,5 +1,4 @@
-"""Rewrite a bag that a crash has cut off, or that is damaged, into a whole one, and account for what is"
-" missing."""
+"""Rewrite a bag that a crash has cut off, or that is damaged, into a whole one, and account for what is missing."""
 
 from __future__ import annotations
 
@@ -18,6 +17,7 @@ from tdof_npid_ros.bag.scan import Table
 from tdof_npid_ros.bag.storage import TopicInfo
 from tdof_npid_ros.bag.writer import BagWriter
 
+RECOVERABLE: Final = "ros2msg"  # the language of the definitions of topics that are recovered
 RECORD: Final = "recovered"  # the metadata record that says so in the new bag
 
 
@@ -100,12 +100,14 @@ class _Recovery:
         self._topic_ids: dict[str, int] = {}
         self._gaps: dict[str, _SequenceGaps] = {}
         self.messages: dict[str, int] = {}
+        self.missing: list[str] = []
         self.times: list[tuple[int, int]] = []
 
     def copy(self, file: McapFile) -> None:
         """Take over all that can be read of a file."""
+        self.missing += file.missing
         for topic in file.topics.values():
-            self._announce(topic)
+            self._announce(topic, file)
         for piece in file.pieces():
             self._copy_table(piece.load(), file)
         for name, values in file.metadata:
@@ -115,28 +117,29 @@ class _Recovery:
         """Return the gaps by topic."""
         return {topic: gaps.lost for topic, gaps in self._gaps.items() if gaps.lost is not None}
 
-    def _announce(self, topic: TopicInfo) -> None:
-        if topic.name not in self._topic_ids:
-            if topic.encoding != "ros2msg":
-                raise BagError(
-                    f"topic {topic.name} is not CDR with a definition in ros2msg: it cannot be recovered"
-                )
+    def _announce(self, topic: TopicInfo, file: McapFile) -> None:
+        if topic.encoding != RECOVERABLE:
+            what = f"{topic.count} messages of topic {topic.name}, in {topic.encoding or 'an unknown format'}"
+            self.missing.append(f"{file.path}: {what}, not CDR with a definition in ros2msg")
+        elif topic.name not in self._topic_ids:
             self._topic_ids[topic.name] = self._writer.add_topic(
                 topic.name, topic.type, qos=topic.qos, definition=topic.definition, type_hash=topic.type_hash
             )
             self.messages[topic.name] = 0
 
     def _copy_table(self, table: Table, file: McapFile) -> None:
+        names = {channel: name for channel, name in file.topic_of.items() if file.topics[name].encoding == RECOVERABLE}
+        ids = {channel: self._topic_ids[name] for channel, name in names.items()}
+        table = table.only(np.isin(table.channel, list(ids)))
         if not table.log_time.size:
             return
         self.times.append((int(table.log_time.min()), int(table.log_time.max())))
         data = table.data.data
-        ids = {channel: self._topic_ids[name] for channel, name in file.topic_of.items()}
         for channel, sequence, log_time, publish_time, offset, length in zip(
             *(column.tolist() for column in table[1:]), strict=True
         ):
             self._writer.write(ids[channel], data[offset : offset + length], log_time, publish_time, sequence)
-        for channel, name in file.topic_of.items():
+        for channel, name in names.items():
             numbers = table.sequence[table.channel == channel].astype(np.int64)
             if numbers.size:
                 self.messages[name] += numbers.size
@@ -184,7 +187,7 @@ def recover(source: str | Path, destination: str | Path) -> RecoveryReport:
             sum(file.dropped_bytes for file in files),
             min((start for start, _ in recovery.times), default=0),
             max((end for _, end in recovery.times), default=0),
-            tuple(line for file in files for line in file.missing),
+            tuple(recovery.missing),
         )
         writer.write_metadata(RECORD, {"source": str(source), "report": "\n".join(report.lines())})
     return report

@@ -20,7 +20,8 @@ AT_END: Final = 0
 CUT_SHORT: Final = 1  # a record goes on beyond the data
 WRONG_LENGTH: Final = 2  # a message record too short for its own fields
 WRONG_TIME: Final = 3  # a time beyond 2**63 - 1 ns
-OTHER_RECORD: Final = 4  # no message (only `walk_messages` stops there)
+OTHER_RECORD: Final = 4  # no message (only `run_length` stops there)
+TOO_MANY: Final = 5  # records that are no messages
 
 _compiled: Any = njit(cache=True, nogil=True)
 
@@ -134,8 +135,8 @@ class Table(NamedTuple):
     offset: Ints
     length: Ints
 
-    def only(self, which: NDArray[Any]) -> Table:
-        """Return the messages that an index or mask selects."""
+    def only(self, which: Any) -> Table:
+        """Return the messages that an index, mask or slice selects."""
         return Table(self.data, *(column[which] for column in self[1:]))
 
 
@@ -154,9 +155,14 @@ def run_length(data: Bytes) -> tuple[int, int]:
     return position, stop
 
 
-def walk(data: Bytes) -> Walk:
-    """Index the records in `data`: all of them, or those before the first that is wrong."""
+def walk(data: Bytes, most_others: int) -> Walk:
+    """Index the records in `data`: all of them, or those before the first that is wrong.
+
+    None when more than `most_others` of them are no messages.
+    """
     position, messages, others, stop = _walk_compiled(data, False)
+    if others > most_others:
+        position, messages, others, stop = 0, 0, 0, TOO_MANY
     table = Table(
         data,
         np.empty(messages, np.uint16),

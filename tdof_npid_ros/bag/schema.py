@@ -94,6 +94,4 @@ def type_hash(type_name: str) -> str:
         hashes = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
         return next(str(entry["hash_string"]) for entry in hashes if entry["type_name"] == type_name)
     except (OSError, ValueError, KeyError, TypeError, StopIteration):
-        raise BagError(
-            f"cannot read the type hash of {type_name!r} from {path}: install its package again"
-        ) from None
+        raise BagError(f"cannot read the type hash of {type_name!r} from {path}: install its package again") from None

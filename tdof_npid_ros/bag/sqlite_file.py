@@ -18,6 +18,8 @@ from tdof_npid_ros.bag.storage import Piece, TopicInfo
 
 _PIECE_MESSAGES: Final = 8192
 _NEEDED: Final = {"topics", "messages"}
+_READ: Final = {*_NEEDED, "message_definitions"}
+_TABLES: Final = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
 
 
 class SqliteFile:
@@ -75,9 +77,11 @@ class SqliteFile:
             ) from None
 
     def _open(self) -> None:
-        tables = {name for (name,) in self._query("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not tables >= _NEEDED:
+        tables = {name: str(sql) for name, sql in self._query(_TABLES)}
+        if not tables.keys() >= _NEEDED:
             raise BagError(f"{self.path}: has no tables `topics` and `messages`: it is no bag")
+        for name in tables.keys() & _READ:
+            self._check_stored(name, tables[name])
         columns = {str(row[1]) for row in self._query("PRAGMA table_info(topics)")}
         definitions = self._definitions() if "message_definitions" in tables else {}
         counts = dict(self._query("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
@@ -90,9 +94,7 @@ class SqliteFile:
             "type_description_hash",
         ]
         chosen = ", ".join(name if name in columns else "''" for name in wanted)
-        for number, name, type_name, serialization, qos, digest in self._query(
-            f"SELECT {chosen} FROM topics"
-        ):
+        for number, name, type_name, serialization, qos, digest in self._query(f"SELECT {chosen} FROM topics"):
             if not isinstance(number, int) or not 0 <= number < 2**16:
                 raise BagError(f"{self.path}: topic number {str(number)[:20]!r} is none: the file is damaged")
             encoding, text = definitions.get(type_name, ("", ""))
@@ -113,6 +115,12 @@ class SqliteFile:
             raise BagError(f"{self.path}: holds messages of a topic that is not listed: the file is damaged")
         self._find_pieces()
 
+    def _check_stored(self, table: str, sql: str) -> None:
+        """Refuse content that is made up while it is read, and so may be larger than any file."""
+        hidden = any(row[6] for row in self._query(f"PRAGMA table_xinfo({table})"))
+        if hidden or "virtual" in sql.lower().split()[:2]:
+            raise BagError(f"{self.path}: its table `{table}` is computed, not stored: no recorder writes this")
+
     def _definitions(self) -> dict[Any, tuple[Any, Any]]:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         return {name: (encoding, text) for name, encoding, text in self._query(query)}
@@ -124,9 +132,7 @@ class SqliteFile:
         except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
             raise BagError(f"{self.path}: its times cannot be read ({error}): the file is damaged") from None
         if times.size and (times[0] < 0 or times[-1] == 2**63 - 1):
-            raise BagError(
-                f"{self.path}: a message's time is before 1970 or beyond 2262: the file is damaged"
-            )
+            raise BagError(f"{self.path}: a message's time is before 1970 or beyond 2262: the file is damaged")
         self.start_ns = int(times[0]) if times.size else 0
         self.end_ns = int(times[-1]) if times.size else 0
         self._starts = np.unique(times[::_PIECE_MESSAGES]).tolist()

@@ -11,8 +11,7 @@ from tdof_npid_ros.bag.scan import Table
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A topic: `count` messages, the type with its `definition` (`ros2msg`), QoS profiles (YAML), RIHS01"
-    " hash."""
+    """A topic: `count` messages of a type, its `definition` (`ros2msg`), QoS profiles (YAML) and RIHS01 hash."""
 
     name: str
     type: str

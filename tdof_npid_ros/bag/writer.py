@@ -69,9 +69,7 @@ class BagWriter:
         if compression not in COMPRESSIONS:
             raise BagError(f"compression {compression!r} is unknown: choose one of {', '.join(COMPRESSIONS)}")
         if max_bytes < 0 or max_duration_s < 0 or not flush_interval_s > 0:
-            raise BagError(
-                "max_bytes and max_duration_s must not be negative, flush_interval_s must be positive"
-            )
+            raise BagError("max_bytes and max_duration_s must not be negative, flush_interval_s must be positive")
         self.folder = Path(folder)
         self.custom_data = dict(custom_data or {})
         self._compression = compression
@@ -89,9 +87,7 @@ class BagWriter:
         try:
             self.folder.mkdir(parents=True)
         except FileExistsError:
-            raise BagError(
-                f"{self.folder} exists already and is not overwritten: choose another name"
-            ) from None
+            raise BagError(f"{self.folder} exists already and is not overwritten: choose another name") from None
         except OSError as error:
             raise BagError(f"cannot create the bag {self.folder}: {error.strerror}") from None
         self._guarded(self._open_file)
@@ -306,9 +302,7 @@ class BagWriter:
 
     def _write_table(self) -> None:
         files = [*self._finished] if self._closed else [*self._finished, self._file]
-        counts = {
-            channel.id: sum(file.counts.get(channel.id, 0) for file in files) for channel in self._channels
-        }
+        counts = {channel.id: sum(file.counts.get(channel.id, 0) for file in files) for channel in self._channels}
         table = metadata.BagMetadata(
             topics=[
                 metadata.TopicEntry(
@@ -317,8 +311,7 @@ class BagWriter:
                 for channel, (type_name, quality) in zip(self._channels, self._types, strict=True)
             ],
             files=[
-                metadata.FileEntry(file.path.name, file.start_ns, file.end_ns, file.message_count)
-                for file in files
+                metadata.FileEntry(file.path.name, file.start_ns, file.end_ns, file.message_count) for file in files
             ],
             custom_data=self.custom_data,
         )

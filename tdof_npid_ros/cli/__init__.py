@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {
@@ -21,28 +23,60 @@ SUBCOMMANDS = {
     "bench": "measure the claims about speed on this machine",
 }
 USAGE_ERROR = 2
+INTERRUPTED = 130  # as a shell gives it after Ctrl-C
+READER_GONE = 141  # as a shell gives it when the reader of a pipe has gone
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong with the arguments."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE_ERROR, f"{self.prog}: {message}: see {self.prog} --help\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit status: 0 only on success, 2 for bad input."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    parser = argparse.ArgumentParser(prog="tdof-npid", description="Nonlinear two-degree-of-freedom PID control loops.")
+    name = given[0] if given and given[0] in SUBCOMMANDS else ""
+    try:
+        status = _run(given, name)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # before OSError, which it is: whoever reads our output has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_GONE
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"tdof-npid {name}: {_one_line(error)}", file=sys.stderr)
+        return USAGE_ERROR
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rclpy":
+            raise
+        print(
+            f"tdof-npid {name}: needs ROS 2: source an installed one, or pip install 'tdof_npid_ros[ros]'",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print(f"tdof-npid {name}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(given: list[str], chosen: str) -> int:
+    parser = _Parser(prog="tdof-npid", description="Nonlinear two-degree-of-freedom PID control loops.")
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         subparser.add_argument("--json", action="store_true", help="print one JSON object, for scripts")
-        if given and given[0] == name:
+        if name == chosen:
             importlib.import_module(f"{__name__}.{name}").add_arguments(subparser)
     parsed = parser.parse_args(given)
-    module = importlib.import_module(f"{__name__}.{parsed.subcommand}")
-    try:
-        return int(module.run(parsed))
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"tdof-npid {parsed.subcommand}: {error}", file=sys.stderr)
-        return USAGE_ERROR
-    except KeyboardInterrupt:
-        print(f"tdof-npid {parsed.subcommand}: interrupted", file=sys.stderr)
-        return 130
+    return int(importlib.import_module(f"{__name__}.{parsed.subcommand}").run(parsed))
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
 
 
 def entry() -> None:

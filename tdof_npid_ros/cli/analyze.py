@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
+from tdof_npid_ros.tuning.output_file import check_writable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of every episode and write what was asked for."""
+    for path in (arguments.png, arguments.html, arguments.csv):
+        if path is not None:
+            check_writable(path)
     report = analyze(arguments.bags)
     written = []
     if arguments.png:

@@ -32,7 +32,7 @@ SUBSCRIBERS = {"output": 2, "control_effort": 2, "controller_state": 1, "scenari
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
-    parser.add_argument("--bag", type=Path, help="folder of the bag (default: bags/demo-<time>)")
+    parser.add_argument("--bag", type=Path, metavar="DIR", help="folder of the bag (default: bags/demo-<time>)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,8 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     case = load_case(CASE)
     bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
-    if bag.exists():
-        raise FileExistsError(f"{bag} exists already and is not overwritten: choose another --bag")
+    _check_free(bag)
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "tuned.yaml"
         _tune(result, quiet=arguments.json)
@@ -63,6 +62,18 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"next     {program} verify {bag}")
         print(f"         {program} analyze {bag} --html report.html")
     return 0
+
+
+def _check_free(bag: Path) -> None:
+    """Refuse a folder that could not be recorded to, before the tuning has taken its time."""
+    if bag.exists():
+        raise FileExistsError(f"{bag} exists already and is not overwritten: choose another --bag")
+    try:
+        bag.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=bag.parent):
+            pass
+    except OSError as error:
+        raise RuntimeError(f"the bag {bag} cannot be written: {error.strerror}") from error
 
 
 @contextmanager
@@ -87,11 +98,13 @@ def _tune(result: Path, quiet: bool) -> None:
     if not quiet:
         print(f"Tuning {TUNED_TYPE} through a loop of plant, controller and tuner in {NAMESPACE} …", flush=True)
     with _loop({"plant": {}, "controller": {}, "tuner": tuner}) as conductor:
-        with tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR) as bar:
+        with tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar:
 
             def finished() -> bool:
+                best = conductor.fact("tuner", "best")
+                text = "first generation" if best in ("", "inf") else f"best IAE {best[:7]}"
+                bar.set_description(f"{text:16}", refresh=False)
                 bar.update(int(conductor.fact("tuner", "generation") or 0) - bar.n)
-                bar.set_description(f"best IAE {conductor.fact('tuner', 'best')[:7]:7}")
                 return conductor.fact("tuner", "state") in ("finished", "failed")
 
             conductor.wait(finished, "the end of the tuning", PLAY_TIMEOUT)
@@ -113,7 +126,7 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
     with _loop(nodes) as conductor:
         conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
         episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
-        with tqdm(total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR) as bar:
+        with tqdm(total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR, mininterval=_REDRAWN) as bar:
             for round_, (name, gains) in enumerate(rounds.items()):
                 bar.set_description(f"{name:17}")
                 conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
@@ -130,6 +143,7 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
             bar.update(bar.total - bar.n)
 
 
+_REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable
 _TUNING_BAR = "{desc} |{bar:30}| generation {n:.0f}/{total:.0f} [{elapsed}]"
 _PLAYING_BAR = "{desc} |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
 

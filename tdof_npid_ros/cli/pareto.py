@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from tqdm import tqdm
 from tdof_npid_ros.case import controller_type
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.paper.output import claim_folder
-from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
-from tdof_npid_ros.tuning.pareto import GENERATIONS, RATIOS, Front, pareto_front
+from tdof_npid_ros.parameter_file import write_parameters
+from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.output_file import check_writable
+from tdof_npid_ros.tuning.pareto import GENERATIONS, RATIOS, Front, check_installed, foptd_case, pareto_front
 
 SUBCOMMAND = "pareto"
 
@@ -28,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--controller", nargs="+", default=list(CONTROLLER_TYPES), metavar="TYPE", help="default: all four"
     )
     parser.add_argument("--seed", type=int, default=0, help="of NSGA-II (default: 0)")
-    parser.add_argument("--generations", type=int, default=GENERATIONS, help=f"default: {GENERATIONS}")
+    parser.add_argument("--generations", type=int, default=GENERATIONS, metavar="N", help=f"default: {GENERATIONS}")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write fronts.csv, fronts.json and fronts.png there")
     parser.add_argument(
         "--write",
@@ -37,11 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write one point as a ROS parameter file (one --ratio and --controller)",
     )
     picked = parser.add_mutually_exclusive_group()
-    picked.add_argument("--index", type=int, help="of the point to write, by increasing IAE_SP")
+    picked.add_argument("--index", type=int, metavar="N", help="of the point to write, by increasing IAE_SP")
     picked.add_argument(
         "--weight",
         type=float,
-        default=1.0,
         metavar="W",
         help="write the point with the least IAE_SP + W·IAE_DIS (default: 1)",
     )
@@ -51,8 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Find the fronts, print them, and write what was asked for."""
     controllers = [controller_type(name) for name in dict.fromkeys(arguments.controller)]
     ratios = list(dict.fromkeys(arguments.ratio))
-    if arguments.write:
-        _refuse_unwritable(arguments.write, len(controllers) * len(ratios))
+    _refuse_bad_arguments(arguments, len(controllers) * len(ratios))
+    check_installed()
+    for ratio in ratios:
+        foptd_case(ratio)
     if arguments.out:
         claim_folder(arguments.out, SUBCOMMAND)
     fronts = []
@@ -73,21 +77,35 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out:
         _write(fronts, rows, arguments.out)
     if arguments.write:
-        index = fronts[0].best(arguments.weight) if arguments.index is None else arguments.index
+        weight = 1.0 if arguments.weight is None else arguments.weight
+        index = fronts[0].best(weight) if arguments.index is None else arguments.index
         write_parameters(arguments.write, fronts[0].parameters(index))
     print(json.dumps({"seed": arguments.seed, "points": rows}) if arguments.json else _table(fronts))
     return 0
 
 
-def _refuse_unwritable(path: Path, fronts: int) -> None:
+def _refuse_bad_arguments(arguments: argparse.Namespace, fronts: int) -> None:
+    """Before minutes are spent on what could not be picked or written in the end."""
+    path, index, weight = arguments.write, arguments.index, arguments.weight
+    if arguments.seed < 0:
+        raise TuningError(f"--seed {arguments.seed}: it must not be below 0")
+    if arguments.generations < 1:
+        raise TuningError(f"--generations {arguments.generations}: at least 1")
+    if index is not None and index < 0:
+        raise TuningError(f"--index {index}: points are numbered from 0")
+    if weight is not None and not 0.0 <= weight < math.inf:
+        raise TuningError(f"--weight {weight}: it must be finite and not below 0")
+    if path is None and (index, weight) != (None, None):
+        raise TuningError("--index and --weight pick the point to write: give --write FILE too")
+    if path is None:
+        return
     if fronts != 1:
-        raise ParameterFileError(
+        raise TuningError(
             f"--write takes a point of one front, but there are {fronts}: give one --ratio and --controller"
         )
     if path.exists():
-        raise ParameterFileError(f"{path} exists: give another file")
-    if not path.parent.is_dir():
-        raise ParameterFileError(f"{path} cannot be written: there is no folder {path.parent}")
+        raise TuningError(f"{path} exists: give another file")
+    check_writable(path)
 
 
 def _write(fronts: list[Front], rows: list[dict[str, Any]], folder: Path) -> None:

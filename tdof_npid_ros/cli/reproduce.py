@@ -8,7 +8,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from tdof_npid_ros.paper.reproduce import Effort, Reproduction, reproduce
+from tdof_npid_ros.paper.output import claim_folder
+from tdof_npid_ros.paper.reproduce import SUBCOMMAND, Effort, Reproduction, reproduce
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="a new or empty folder, or an earlier output"
     )
-    parser.add_argument("--only", default="", metavar="NAMES", help="some of them, as table4,figure9 (default: all)")
+    parser.add_argument("--only", metavar="NAMES", help="some of them, as table4,figure9 (default: all)")
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="HGA runs per row; the best counts (default: 1)"
     )
@@ -24,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute, write, and say where the page is and what came out."""
-    only = [name.strip().lower() for name in arguments.only.split(",") if name.strip()]
+    only = [] if arguments.only is None else [name.strip().lower() for name in arguments.only.split(",")]
     reproduction = Reproduction(only, Effort(seeds=arguments.seeds))
+    claim_folder(arguments.out, SUBCOMMAND)
     with tqdm(total=len(reproduction.jobs(arguments.out)), unit="job", leave=False) as bar:
         summary = reproduce(arguments.out, reproduction, lambda label: _show(bar, label))
     if arguments.json:

@@ -48,6 +48,10 @@ def _table(report: dict[str, Any]) -> str:
     lines = [f"{report['case']}  {report['controller']}  {gains}"]
     for episode in ("setpoint", "disturbance"):
         for name, value in report[episode].items():
-            shown = value if isinstance(value, str) else "-" if value is None else f"{value:.4f}"
+            shown = value if isinstance(value, str) else "-" if value is None else _number(value)
             lines.append(f"  {episode:12} {name:18} {shown}")
-    return "\n".join([*lines, f"  objective {report['objective']:.5f}"])
+    return "\n".join([*lines, f"  objective {_number(report['objective'])}"])
+
+
+def _number(value: float) -> str:
+    return f"{value:.4f}" if abs(value) < 1e6 else f"{value:.3g}"  # a loop that diverges

@@ -6,7 +6,6 @@ import argparse
 import json
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,17 +14,19 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
+
 from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
+from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import response_report
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
+from tdof_npid_ros.tuning.output_file import check_writable
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study, TuningResult
-
-INTERRUPTED = 130  # exit status, as a shell gives it after Ctrl-C
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,14 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
     parser.add_argument("--controller", required=True, metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
     parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same result (default: 0)")
-    parser.add_argument("--free", choices=["sigma"], help="tune this too")
+    parser.add_argument("--free", choices=["sigma"], help="tune the width of k(e) too")
     parser.add_argument("--weight", type=float, help="w of IAE_SP + w·IAE_DIS (default: the case's)")
     parser.add_argument("--algorithm", default="hga", metavar="|".join(ALGORITHMS), help="default: hga")
-    parser.add_argument("--population", type=int, default=POPULATION, help=f"default: {POPULATION}")
+    parser.add_argument("--population", type=int, default=POPULATION, metavar="N", help=f"default: {POPULATION}")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--generations", type=int, help=f"of a whole population each (default: {GENERATIONS})")
-    length.add_argument("--budget", type=int, help="evaluations, instead of --generations")
-    parser.add_argument("--polish", type=int, default=POLISH, help=f"candidates a step of the HGA's polish ({POLISH})")
+    length.add_argument("--generations", type=int, metavar="N", help=f"of a whole population each (default: {GENERATIONS})")
+    length.add_argument("--budget", type=int, metavar="N", help="evaluations, instead of --generations")
+    parser.add_argument("--polish", type=int, default=POLISH, metavar="N", help=f"candidates in a step of the HGA's polish, 0: none (default: {POLISH})")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")
@@ -51,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Tune, print the optimum's metrics, and write what was asked for."""
     _check_outputs(arguments)
     problem = _problem(arguments)
+    _check_episodes(problem)
     study = Study(problem, arguments.checkpoint, arguments.resume)
     started = time.monotonic()
     with _interrupt_requested() as interrupted, _progress(study, shown=not arguments.json) as show:
@@ -93,6 +95,11 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
     )
 
 
+def _check_episodes(problem: TuningProblem) -> None:
+    """Refuse episodes whose metrics could not be told at the end, whatever the gains."""
+    response_report(problem.case, problem.gains(np.array([low for low, _ in problem.bounds])))
+
+
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse outputs that cannot be written before hours are spent on what goes there."""
     if arguments.resume and not arguments.checkpoint:
@@ -102,15 +109,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     if len({path.resolve() for path in taken}) < len(taken):
         raise TuningError("the case, --checkpoint, --out and --plot must be different files")
     for path in written:
-        try:
-            if path.exists():
-                with path.open("r+b"):
-                    pass
-            else:
-                with tempfile.TemporaryFile(dir=path.parent):
-                    pass
-        except OSError as error:
-            raise TuningError(f"{path} cannot be written: {error.strerror}") from error
+        check_writable(path)
 
 
 @contextmanager

@@ -86,6 +86,13 @@ class Controller:
         self._applied = self._integral = None
         self._settled = False
 
+    def warm_up(self) -> None:
+        """Compile all that an answer may need, so that no answer waits for it; for a controller at its start."""
+        nothing = np.zeros(self.lanes)
+        self.begin_within(nothing)
+        self.answer(0, nothing, nothing)
+        self.reset()
+
     def begin_within(self, applied: np.ndarray, integral: np.ndarray | None = None) -> None:
         """Let the next answer begin within a running loop, without a jump.
 

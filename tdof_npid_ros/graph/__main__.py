@@ -51,5 +51,6 @@ def replay() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in NODES:
-        sys.exit(f"usage: python -m tdof_npid_ros.graph {{{','.join(NODES)}}} [--ros-args ...]")
+        print(f"usage: python -m tdof_npid_ros.graph {{{','.join(NODES)}}} [--ros-args ...]", file=sys.stderr)
+        sys.exit(2)
     run(sys.argv[1], sys.argv[1:])

@@ -14,6 +14,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from tdof_npid_ros.graph.messages import stamp_ns
+from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 
 POLL = 0.02  # s
 
@@ -31,6 +32,7 @@ class Conductor:
     """
 
     def __init__(self, namespace: str, check: Callable[[], None]) -> None:
+        use_fast_dds_profile()
         rclpy.init()
         self._node = rclpy.create_node("conductor", namespace=namespace, start_parameter_services=False)
         self._check = check

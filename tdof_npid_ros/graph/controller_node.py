@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -21,7 +22,15 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import NO_VALUES, as_field, plan_from_message, signal_message, stamp_ns, values
+from tdof_npid_ros.graph.messages import (
+    NO_VALUES,
+    as_field,
+    lane_names,
+    plan_from_message,
+    signal_message,
+    stamp_ns,
+    values,
+)
 from tdof_npid_ros.graph.node import (
     ERROR,
     LATCHED_QOS,
@@ -80,17 +89,16 @@ class ControllerNode(LoopNode):
         self.controller = Controller(
             gains_from_mapping(given), sample_period_in_ns(period), operation_from_mapping(given)
         )
-        nothing = np.zeros(self.controller.lanes)
-        self.controller.answer(0, nothing, nothing)  # compiles, before the first output
-        self.controller.reset()
+        self.controller.warm_up()
         self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
         if self.joints.names and len(self.joints.names) != self.controller.lanes:
             raise ValueError(
                 f"joint_names has {len(self.joints.names)} names, but the gains are for {self.controller.lanes} lanes: "
                 "give kp one value per joint"
             )
-        self.checked({})
-        self.changed(self.values_of(["setpoint", "output_timeout"]))
+        options = self.values_of(["setpoint", "output_timeout"])
+        self.checked(options)
+        self.changed(options)
         self.saved_integral: np.ndarray | None = None
         self.plan: Plan | None = None
         self.stamps = Stamps()
@@ -125,13 +133,13 @@ class ControllerNode(LoopNode):
         self.controller.reset()
         self.latest_arrival_ns: int | None = None
         self.silent = False
+        self.common_setpoint = np.zeros(self.controller.lanes)
         self.effort = signal_message("")
-        self.effort.name = self.joints.names
         self.effort_for = ("", "")
         self.terms = signal_message("")
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
         recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
-        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos)
+        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
@@ -174,7 +182,8 @@ class ControllerNode(LoopNode):
             self.counts["rejected"] += 1
 
     def _on_output(self, message: JointState) -> None:
-        stamp, episode = stamp_ns(message.header.stamp), message.header.frame_id
+        header = message.header
+        stamp, episode = stamp_ns(header.stamp), header.frame_id
         y = self._picked("output", message.name, message.position)
         if y is None or not self._is_sound(y):
             return
@@ -183,20 +192,27 @@ class ControllerNode(LoopNode):
                 self.waiting = message  # its plan is on the way
                 return
             self.waiting = None
-            setpoint = np.full(self.controller.lanes, self.plan.value_at("setpoint", stamp))
+            setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
             episode = ""  # a robot's frame
-            setpoint = np.broadcast_to(self.setpoint, (self.controller.lanes,))
+            setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
         verdict = self.stamps.take(stamp, episode)
         if verdict == "late":
             self.counts["late"] += 1
             return
         begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, message)
-        if self.controller.answer(stamp, setpoint, y):
-            self._note_answer(setpoint, begins_within)
-        else:
-            self.counts["repeated"] += 1
-        self._publish_answer(message, episode)
+        is_new = self.controller.answer(stamp, setpoint, y)
+        if is_new:
+            self._fill_answer(header.stamp, episode, setpoint, begins_within)
+        self.effort_publisher.publish(self.effort)
+        # The plant waits for the answer, so all else comes after it.
+        self._note_answer(is_new)
+
+    def _on_every_lane(self, setpoint: float) -> np.ndarray:
+        """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
+        if setpoint != self.common_setpoint[0] or len(self.common_setpoint) != self.controller.lanes:
+            self.common_setpoint = np.full(self.controller.lanes, setpoint)
+        return self.common_setpoint
 
     def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, message: JointState) -> bool:
         """Reset the controller at a loop's start, or let it begin within a running loop; True for the latter."""
@@ -228,14 +244,33 @@ class ControllerNode(LoopNode):
         self.controller.reset()
         return None
 
-    def _note_answer(self, setpoint: np.ndarray, begins_within: bool) -> None:
-        controller = self.controller
-        self.counts["steps"] += 1
-        self.answered_setpoint = setpoint
+    def _fill_answer(self, stamp: Time, episode: str, setpoint: np.ndarray, begins_within: bool) -> None:
+        effort, header, digest = self.effort, self.effort.header, self.controller.digest
+        if self.effort_for != (digest, episode):
+            self.effort_for = (digest, episode)
+            effort.name = self.joints.names or lane_names(self.controller.lanes)
+            header.frame_id = f"{digest} {episode}" if episode else digest
+        header.stamp = stamp
+        effort.effort = as_field(self.controller.effort)
+        effort.position = as_field(setpoint)
         # The first answer within a running loop bears the integral action that it began with, for `verify`.
-        self.effort.velocity = as_field(controller.integral_before) if begins_within else NO_VALUES
+        effort.velocity = as_field(self.controller.integral_before) if begins_within else NO_VALUES
+
+    def _on_effort_matched(self, status: Any) -> None:
+        """A reader of `control_effort` has come. A plant in lockstep may be waiting for what it could not hear yet."""
+        if status.current_count_change > 0 and "/" in self.effort_for[1]:
+            self.effort_publisher.publish(self.effort)
+
+    def _note_answer(self, is_new: bool) -> None:
+        controller = self.controller
+        if not is_new:
+            self.counts["repeated"] += 1
+            return
+        self.counts["steps"] += 1
         if not controller.gains.effort_min < controller.effort[0] < controller.gains.effort_max:
             self.counts["saturated"] += 1
+        if self.state_publisher.get_subscription_count():
+            self._publish_terms()
 
     def _picked(self, topic: str, names: Sequence[str], field: Any) -> np.ndarray | None:
         """A field's values for the lanes; None if it is refused."""
@@ -269,17 +304,6 @@ class ControllerNode(LoopNode):
 
     # What goes out
 
-    def _publish_answer(self, output: JointState, episode: str) -> None:
-        if self.effort_for != (self.controller.digest, episode):
-            self.effort_for = (self.controller.digest, episode)
-            self.effort.header.frame_id = f"{self.controller.digest} {episode}" if episode else self.controller.digest
-        self.effort.header.stamp = output.header.stamp
-        self.effort.effort = as_field(self.controller.effort)
-        self.effort.position = as_field(self.answered_setpoint)
-        self.effort_publisher.publish(self.effort)
-        if self.state_publisher.get_subscription_count():
-            self._publish_terms()
-
     def _publish_terms(self) -> None:
         lanes = self.controller.lanes
         if len(self.terms.name) != len(TERMS) * lanes:
@@ -292,9 +316,13 @@ class ControllerNode(LoopNode):
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
-        self._configured(changes)
-        p = {**self.values_of(["setpoint", *SECONDS]), **changes}
-        self._setpoint(p["setpoint"])
+        gains, _ = self._configured(changes)
+        setpoint = self._setpoint(changes["setpoint"]) if "setpoint" in changes else self.setpoint
+        if len(setpoint) not in (1, gains.lanes):
+            raise ValueError(
+                f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or one per lane"
+            )
+        p = {**self.values_of(list(SECONDS)), **changes}
         for name, (low, high) in SECONDS.items():
             number(name, p[name], low, high)
 
@@ -330,8 +358,6 @@ class ControllerNode(LoopNode):
 
     def _setpoint(self, value: Any) -> np.ndarray:
         one_per_lane = value if isinstance(value, list) else [value]
-        if len(one_per_lane) not in (1, self.controller.lanes):
-            raise ValueError(f"setpoint has {len(one_per_lane)} values: give one, or one per lane")
         return np.array([number("setpoint", one, -LARGEST_SIGNAL, LARGEST_SIGNAL) for one in one_per_lane])
 
     def state(self) -> tuple[int, str, dict[str, object]]:

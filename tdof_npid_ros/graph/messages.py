@@ -16,6 +16,7 @@ from tdof_npid_ros.scenario import Plan
 
 SECOND = 1_000_000_000  # ns
 NO_VALUES = array("d")
+NAMED_LANES = 8  # more are read by programs, which go by the place
 
 
 def stamp_ns(stamp: Time | Duration) -> int:
@@ -77,6 +78,11 @@ def diagnostics_message(stamp: Time, name: str, level: int, text: str, facts: Ma
         values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
     )
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+def lane_names(lanes: int) -> list[str]:
+    """What a signal bears in `name`: viewers such as PlotJuggler show only values that have one."""
+    return [f"lane{lane}" for lane in range(lanes)] if lanes <= NAMED_LANES else []
 
 
 def signal_message(frame_id: str) -> JointState:

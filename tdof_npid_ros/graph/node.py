@@ -24,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
+from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
 
 SIGNAL_QOS = signal_qos(1000)
@@ -341,6 +342,7 @@ class StartError(RuntimeError):
 
 
 def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> LoopNode:
+    use_fast_dds_profile()
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()

@@ -89,13 +89,14 @@ class LockstepPlant:
         if self.stopped:
             node.get_logger().info("the controller answers again: going on")
             self.running, self.stopped = True, False
-        node.counts["steps"] += 1
         if episode.answer(values(message.effort)):
             self._publish_when_logged(episode)
         else:
             self.running = False
             node.get_logger().info(f"episode {self.episodes} finished")
             self._publish_clock()
+        node.counts["steps"] += 1
+        if not self.running:
             node.publish_diagnostics()
 
     def _publish_when_logged(self, episode: Episode) -> None:

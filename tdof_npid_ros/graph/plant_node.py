@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import as_field, set_stamp, signal_message, values
+from tdof_npid_ros.graph.messages import as_field, lane_names, set_stamp, signal_message, values
 from tdof_npid_ros.graph.node import LoopNode, number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
@@ -49,9 +49,13 @@ class PlantNode(LoopNode):
         self.lossless = self.declare_value(
             "lossless", False, "lockstep: never run ahead of what the recorder has got; needs a recorder", fixed=True
         )
+        names = self.declare_value("joint_names", [""], "name of each lane in output; none: lane0, …", fixed=True)
+        self.joints = [str(name) for name in names if name]
         self.checked({})
         self.accept_changes()
+        self.output = signal_message("")
         self.make_simulator()
+        self.simulator.warm_up()
         self.way_of_running = MODES[self.mode](self)
 
     def _declare_model(self) -> None:
@@ -93,7 +97,7 @@ class PlantNode(LoopNode):
 
     def activate(self) -> None:
         """Create topics, services and timers."""
-        self.output = signal_message("")
+        self.output.header.frame_id = ""
         promised = self.values_of(["deadline", "lease"])
         deadline = promised["deadline"] if self.mode == "realtime" else 0.0
         qos = signal_qos(1000, deadline, promised["lease"])
@@ -127,6 +131,7 @@ class PlantNode(LoopNode):
         """Begin again, at the initial state, with the parameters as they are now."""
         lanes = int(self.values_of(["lanes"])["lanes"])
         self.simulator = PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
+        self.output.name = self.joints or lane_names(lanes)
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
@@ -151,6 +156,8 @@ class PlantNode(LoopNode):
             raise ValueError(f"fallback is {p['fallback']!r}: it must be one of {', '.join(FALLBACKS)}")
         if isinstance(p["lanes"], bool) or not isinstance(p["lanes"], int) or not 1 <= p["lanes"] <= 100_000:
             raise ValueError(f"lanes is {p['lanes']!r}: it must be a whole number from 1 to 100000")
+        if self.joints and len(self.joints) != p["lanes"]:
+            raise ValueError(f"joint_names has {len(self.joints)} names, but lanes is {p['lanes']}: give one name per lane")
         if not number("effort_min", p["effort_min"]) <= number("effort_max", p["effort_max"]):
             raise ValueError(
                 f"effort_min is {p['effort_min']} and effort_max {p['effort_max']}: need effort_min <= effort_max"

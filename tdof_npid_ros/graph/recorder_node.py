@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from tdof_npid_ros.graph.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
-from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread
+from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread, message_class
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
 CALM_DISCOVERY_PERIOD = 0.5  # s, when it does not
@@ -45,6 +46,7 @@ EXPECTED = {
     "disturbance": "sensor_msgs/msg/JointState",
     "controller_state": "sensor_msgs/msg/JointState",
     "scenario_plan": "trajectory_msgs/msg/JointTrajectory",
+    "/clock": "rosgraph_msgs/msg/Clock",
 }
 
 
@@ -61,31 +63,50 @@ class RecorderNode(LoopNode):
         self.compression = self.declare_value(
             "compression", "zstd", f"of the chunks: {', '.join(COMPRESSIONS)}", fixed=True
         )
-        self.max_bytes = self.declare_value("max_bytes", 0, "a new file begins at this size; 0: never", fixed=True)
+        self.max_bytes = round(
+            number(
+                "max_bytes",
+                self.declare_value("max_bytes", 0, "a new file begins at this size; 0: never", fixed=True),
+                low=0.0,
+            )
+        )
         self.max_duration = number(
             "max_duration",
             self.declare_value("max_duration", 0.0, "s; a new file begins after this time; 0: never", fixed=True),
             low=0.0,
         )
-        self.topics = self.declare_value(
-            "topics",
-            EVERYTHING,
-            "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace",
-            fixed=True,
+        self.topics = _patterns(
+            self.declare_value(
+                "topics",
+                EVERYTHING,
+                "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace",
+                fixed=True,
+            )
         )
-        self.exclude = self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True)
+        self.exclude = _patterns(self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True))
         self.lossless = self.declare_value(
             "lossless", False, "tell the plant on `recorded` how far the log is; the plant needs it, too", fixed=True
         )
         self.accept_changes()
-        self.failure = ""
+        self._begin_account()
         self.taps: dict[str, Tap] = {}
         self.writer = self._open() if self.autostart else None
+
+    def _begin_account(self) -> None:
+        """Each bag has its own."""
+        self.failure = ""
+        self.counts["recorded"] = 0
+        self.topic_ids: dict[str, int] = {}  # in the bag
+        self.left: list[Taken] = []  # by taps that were closed
+        self.lost_by_topic: Counter[str] = Counter()  # on taps that were closed
+        self.missed_by_topic: Counter[str] = Counter()  # published before the recorder came
+        self.not_recorded: set[str] = set()
 
     def activate(self) -> None:
         """Open the bag and subscribe."""
         self.writer = self.writer or self._open()
-        self.lock = threading.Lock()  # of taps, which the thread looks at
+        self._begin_account()
+        self.lock = threading.Lock()  # of what this thread and that of the taps share: taps, topic_ids, left
         self.snapshots = ParameterSnapshots(self, self._write_snapshot)
         self.graph: object = None
         self.calm_looks = 0
@@ -96,7 +117,7 @@ class RecorderNode(LoopNode):
         if self.lossless:
             self.progress = LogProgress([self.resolve_topic_name(name) for name in ("output", "control_effort")])
             self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
-        self.thread = TapThread(self._current_taps, self._write)
+        self.thread = TapThread(self._take, self._write)
         self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=STEADY)
         self.get_logger().info(f"recording to {self.folder}")
         self._look()
@@ -116,7 +137,8 @@ class RecorderNode(LoopNode):
             except BagError as error:
                 self.failure = self.failure or str(error)
             self._let_go()
-            print(f"bag {self.folder}: {account['recorded']} messages, {account['lost']} lost", flush=True)
+            failure = f"; {self.failure}" if self.failure else ""
+            print(f"bag {self.folder}: {account['recorded']} messages, {account['lost']} lost{failure}", flush=True)
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse another folder while recording."""
@@ -154,8 +176,8 @@ class RecorderNode(LoopNode):
             return
         self.graph = graph
         for topic, types in topics:
-            if self._wanted(topic) and len(types) == 1:
-                self._follow(topic, types[0])
+            if topic not in self.not_recorded and self._wanted(topic):
+                self._follow(topic, types)
 
     def _wanted(self, topic: str) -> bool:
         namespace = self.get_namespace().rstrip("/") + "/"
@@ -165,20 +187,25 @@ class RecorderNode(LoopNode):
 
         return among(self.topics) and not among(self.exclude)
 
-    def _follow(self, topic: str, type_name: str) -> None:
+    def _follow(self, topic: str, types: list[str]) -> None:
         """Subscribe to a topic, or again if a publisher offers less than what was asked for."""
-        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        tap = self.taps.get(topic)
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [info.qos_profile for info in publishers if tap is None or info.topic_type == tap.type_name]
         if not offered or self.writer is None:
             return  # only subscribed so far
-        tap = self.taps.get(topic)
-        wanted = _as_reliable_as(offered)
         if tap is not None and any(qos_check_compatible(qos, tap.qos)[0] == QoSCompatibility.ERROR for qos in offered):
             self.get_logger().warning(f"{topic}: a publisher offers less than the others: subscribing again")
-            with self.lock:
-                self.taps.pop(topic).close()
+            self._close(topic)
+            types = [tap.type_name]
             tap = None
         if tap is None:
-            tap = self._tap(topic, type_name, wanted)
+            try:
+                tap = self._tap(topic, _recordable(types), _as_reliable_as(offered))
+            except ValueError as error:
+                self.not_recorded.add(topic)
+                self.get_logger().warning(f"{topic} is not recorded: {error}")
+                return
         tap.publishers = max(tap.publishers, len(offered))
 
     def _tap(self, topic: str, type_name: str, qos: QoSProfile) -> Tap:
@@ -187,9 +214,22 @@ class RecorderNode(LoopNode):
             self.taps[topic] = tap
         return tap
 
-    def _current_taps(self) -> list[Tap]:
+    def _close(self, topic: str) -> None:
+        """Unsubscribe, and keep what has come and what was lost."""
         with self.lock:
-            return list(self.taps.values())
+            tap = self.taps.pop(topic)
+            self.left += tap.take()
+            self.lost_by_topic[topic] += tap.lost
+            self.missed_by_topic[topic] += tap.missed
+            tap.close()
+
+    def _take(self) -> list[Taken]:
+        """Called by the taps' thread."""
+        with self.lock:
+            found, self.left = self.left, []
+            for tap in self.taps.values():
+                found += tap.take()
+        return found
 
     # What is written
 
@@ -211,7 +251,7 @@ class RecorderNode(LoopNode):
             return
         try:
             for received_ns, published_ns, sequence, tap, data in messages:
-                topic_id = tap.topic_id or self._announce(writer, tap)
+                topic_id = self.topic_ids.get(tap.topic) or self._topic_id(writer, tap)
                 writer.write(topic_id, data, received_ns, published_ns, sequence)
         except BagError as error:
             self._fail(error)
@@ -225,10 +265,16 @@ class RecorderNode(LoopNode):
         set_stamp(message.header.stamp, time_ns)
         self.progress_publisher.publish(message)
 
+    def _topic_id(self, writer: BagWriter, tap: Tap) -> int:
+        """The topic's number in the bag, where it is announced before its first message."""
+        with self.lock:
+            if tap.topic not in self.topic_ids:
+                self.topic_ids[tap.topic] = self._announce(writer, tap)
+            return self.topic_ids[tap.topic]
+
     def _announce(self, writer: BagWriter, tap: Tap) -> int:
         offered = [_profile(info.qos_profile) for info in self.get_publishers_info_by_topic(tap.topic)]
-        tap.topic_id = writer.add_topic(tap.topic, tap.type_name, qos=offered or [_profile(tap.qos)])
-        return tap.topic_id
+        return writer.add_topic(tap.topic, tap.type_name, qos=offered or [_profile(tap.qos)])
 
     def _write_snapshot(self, event: ParameterEvent, asked_ns: int) -> None:
         tap = self.taps.get(PARAMETER_EVENTS)
@@ -237,7 +283,7 @@ class RecorderNode(LoopNode):
             return
         data = without_padding(tap.type_name, schema.definition(tap.type_name), serialize_message(event))
         try:
-            writer.write(tap.topic_id or self._announce(writer, tap), data, time.time_ns(), asked_ns)
+            writer.write(self._topic_id(writer, tap), data, time.time_ns(), asked_ns)
         except BagError as error:
             self._fail(error)
 
@@ -251,33 +297,60 @@ class RecorderNode(LoopNode):
 
     def _let_go(self) -> None:
         self.discovery.cancel()
-        with self.lock:
-            while self.taps:
-                self.taps.popitem()[1].close()
+        for topic in list(self.taps):
+            self._close(topic)
 
     # State
 
     def _account(self) -> dict[str, str]:
-        taps = self.taps.values()
-        lost = {f"lost {tap.topic}": str(tap.lost) for tap in taps if tap.lost}
-        missed = {f"published before the recorder came {tap.topic}": str(tap.missed) for tap in taps if tap.missed}
-        account = {"namespace": self.get_namespace(), "recorded": str(self.counts["recorded"]), "lost": str(self.lost)}
-        return {**account, **lost, **missed}
+        missed = self.missed_by_topic + Counter({topic: tap.missed for topic, tap in self.taps.items()})
+        return {
+            "namespace": self.get_namespace(),
+            "recorded": str(self.counts["recorded"]),
+            "lost": str(self.lost),
+            **{f"lost {topic}": str(lost) for topic, lost in self._losses().items()},
+            **{f"published before the recorder came {topic}": str(count) for topic, count in missed.items()},
+        }
+
+    def _losses(self) -> Counter[str]:
+        """Messages lost so far, by topic; topics without are left out."""
+        return self.lost_by_topic + Counter({topic: tap.lost for topic, tap in self.taps.items()})
 
     @property
     def lost(self) -> int:
         """Messages lost so far."""
-        return sum(tap.lost for tap in self.taps.values())
+        return self._losses().total()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """What is recorded where, and what went wrong."""
-        facts: dict[str, object] = {"bag": self.folder, "topics": len(self.taps), "lost": self.lost}
+        losses = self._losses()
+        facts: dict[str, object] = {"bag": self.folder, "topics": len(self.taps), "lost": losses.total()}
         if self.failure:
             return ERROR, self.failure, facts
-        if self.lost:
-            worst = max(self.taps.values(), key=lambda tap: tap.lost)
-            return WARN, f"{self.lost} messages lost, most on {worst.topic}: set lossless, or leave topics out", facts
+        if losses:
+            worst = losses.most_common(1)[0][0]
+            return WARN, f"{losses.total()} messages lost, most on {worst}: set lossless, or leave topics out", facts
         return OK, f"recording {len(self.taps)} topics to {self.folder}", facts
+
+
+def _patterns(value: str | list[str]) -> list[str]:
+    return [value] if isinstance(value, str) else list(value)
+
+
+def _recordable(types: list[str]) -> str:
+    """The one type of a topic.
+
+    Raises:
+        ValueError: it has several, or its type is not installed.
+    """
+    if len(types) > 1:
+        raise ValueError(f"its publishers and subscribers do not agree on its type: {', '.join(types)}")
+    message_class(types[0])
+    try:
+        schema.definition(types[0]), schema.type_hash(types[0])
+    except BagError as error:
+        raise ValueError(str(error)) from None
+    return types[0]
 
 
 def _profile(qos: QoSProfile) -> QosProfile:

@@ -26,7 +26,7 @@ from tdof_npid_ros.graph.tap import message_class
 SECOND = 1_000_000_000  # ns
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
-FOR_CONTROLLER = ("scenario_plan", "setpoint", "output")  # what a controller is given
+FOR_CONTROLLER = ("scenario_plan", "setpoint")  # what a controller is given, besides the output
 MATCH_TIMEOUT = 10.0  # s until subscribers must have come, where an answer is needed
 REPLY_TIMEOUT = 0.5  # s until an output is published again
 RETRIES = 20
@@ -59,6 +59,10 @@ class ReplayNode(LoopNode):
             self.recorded = Recorded.read(self.reader, str(self.bag)) if self.compare else None
         except BagError as error:
             raise ValueError(str(error)) from None
+        duration = (self.reader.end_ns - self.reader.start_ns) / SECOND
+        if not self.reader.end_ns or self.start > duration:
+            raise ValueError(f"{self.bag}: nothing in it after {self.start:g} s: it lasts {duration:g} s")
+        self.namespace = self.recorded.namespace if self.recorded else self.reader.custom_data.get("namespace", "/")
         self.comparison = Comparison()
 
     def activate(self) -> None:
@@ -66,7 +70,7 @@ class ReplayNode(LoopNode):
         self.stopping = threading.Event()
         self.answered = threading.Condition()
         self.answer: tuple[str, int] | None = None
-        self.publishers_of = {topic: self._publisher(topic) for topic in self._topics()}
+        self.publishers_of = {topic: publisher for topic in self._topics() if (publisher := self._publisher(topic))}
         self.clock_publisher = self.create_publisher(Clock, CLOCK, 10) if self.clock else None
         if self.compare:
             self.create_subscription(JointState, "control_effort", self._on_answer, SIGNAL_QOS)
@@ -82,20 +86,22 @@ class ReplayNode(LoopNode):
     # What is published
 
     def _topics(self) -> list[str]:
-        wanted = [
-            topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic
-        ]
-        if self.compare:
-            wanted = [topic for topic in wanted if self._relative(topic) in FOR_CONTROLLER]
-        return wanted
+        if self.recorded is not None:
+            given = {self.recorded.output, *(self.recorded.namespace + name for name in FOR_CONTROLLER)}
+            return [topic for topic in self.reader.topics if topic in given]
+        return [topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic]
 
     def _relative(self, topic: str) -> str:
         """A topic's name in the recorded loop's namespace."""
-        return topic.removeprefix(self.reader.custom_data.get("namespace", "/").rstrip("/") + "/")
+        return topic.removeprefix(self.namespace.rstrip("/") + "/")
 
-    def _publisher(self, topic: str) -> Publisher:
+    def _publisher(self, topic: str) -> Publisher | None:
         qos = LATCHED_QOS if self._is_latched(topic) else SIGNAL_QOS
-        return self.create_publisher(message_class(self.reader.topics[topic].type), self._relative(topic), qos)
+        try:
+            return self.create_publisher(message_class(self.reader.topics[topic].type), self._relative(topic), qos)
+        except ValueError as error:
+            self.get_logger().warning(f"{topic} is not replayed: {error}")
+            return None
 
     def _is_latched(self, topic: str) -> bool:
         return "transient_local" in self.reader.topics[topic].qos or self._relative(topic) == "scenario_plan"
@@ -104,11 +110,15 @@ class ReplayNode(LoopNode):
 
     def _play(self) -> None:
         try:
-            if self.compare:
-                self._wait_for_controller()
+            if self.recorded is not None:
+                self._wait_for_controller(self.recorded.output)
             self._play_through()
             while self.loop and not self.stopping.is_set():
                 self._play_through()
+            if self.recorded is not None and not self.comparison.compared and not self.stopping.is_set():
+                raise TimeoutError(
+                    f"nothing was compared: no recorded answer to {self.recorded.output} after the start"
+                )
         except (BagError, TimeoutError) as error:
             self.get_logger().error(str(error))
             self.comparison.failure = str(error)
@@ -118,7 +128,7 @@ class ReplayNode(LoopNode):
         first_ns = self.reader.start_ns + round(self.start * SECOND)
         began = time.monotonic()
         for topic, log_ns, _, data in self._messages(first_ns):
-            if not self.compare:
+            if self.recorded is None:
                 due = began + (log_ns - first_ns) / SECOND / self.rate
                 if self.stopping.wait(max(0.0, due - time.monotonic())):
                     return
@@ -139,8 +149,8 @@ class ReplayNode(LoopNode):
             self._publish_clock(topic, log_ns, data)
         if topic == CLOCK:
             return
-        if self.compare and self._relative(topic) == "output":
-            self._publish_and_wait(topic, data)
+        if self.recorded is not None and topic == self.recorded.output:
+            self._publish_and_wait(self.recorded, data)
         else:
             self.publishers_of[topic].publish(data)
         self.counts["published"] += 1
@@ -153,17 +163,16 @@ class ReplayNode(LoopNode):
 
     # Comparing
 
-    def _wait_for_controller(self) -> None:
-        output = next(p for topic, p in self.publishers_of.items() if self._relative(topic) == "output")
-        self._until(lambda: bool(output.get_subscription_count()), MATCH_TIMEOUT, "no controller takes output")
+    def _wait_for_controller(self, topic: str) -> None:
+        subscribers = self.publishers_of[topic].get_subscription_count
+        self._until(lambda: bool(subscribers()), MATCH_TIMEOUT, f"no controller takes {self._relative(topic)}")
 
-    def _publish_and_wait(self, topic: str, data: bytes) -> None:
-        assert self.recorded is not None
-        expected = self.recorded.key(data)
+    def _publish_and_wait(self, recorded: Recorded, data: bytes) -> None:
+        expected = recorded.key(data)
         if expected is None:
             return  # the recorded controller did not answer it either
         for _ in range(RETRIES):
-            self.publishers_of[topic].publish(data)
+            self.publishers_of[recorded.output].publish(data)
             with self.answered:
                 if self.answered.wait_for(lambda: self.answer == expected or self.stopping.is_set(), REPLY_TIMEOUT):
                     return

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
-from tdof_npid_ros.graph.messages import plan_message, set_stamp, signal_message, stamp_ns
+from tdof_npid_ros.graph.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
 from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
 from tdof_npid_ros.scenario import Plan, parse_plan
 
@@ -170,6 +170,7 @@ class ScenarioNode(LoopNode):
         row = dict(zip(plan.names, plan.values[point], strict=True))
         for name, publisher in self.publishers_of.items():
             message = signal_message("")
+            message.name = lane_names(1) if name == "disturbance" else []  # a setpoint's are names of joints
             set_stamp(message.header.stamp, plan.times_ns[point])
             field = "position" if name == "setpoint" else "effort"
             setattr(message, field, [row.get(name, 0.0)])

@@ -53,9 +53,13 @@ class ParameterSnapshots:
             getter.call_async(GetParameters.Request(names=names)).add_done_callback(lambda f: got(names, f))
 
         def got(names: list[str], future: Any) -> None:
+            values = future.result().values
+            if len(values) < len(names):  # one was undeclared in between
+                self._forget(full_name)
+                return
             event = ParameterEvent(node=full_name, stamp=self._node.get_clock().now().to_msg())
             event.new_parameters = [
-                Parameter(name=name, value=value) for name, value in zip(names, future.result().values, strict=True)
+                Parameter(name=name, value=value) for name, value in zip(names, values, strict=True)
             ]
             self._take(event, asked_ns)
 

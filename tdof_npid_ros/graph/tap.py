@@ -45,7 +45,6 @@ class Tap:
     """One topic's subscription.
 
     Attributes:
-        topic_id: in the bag; None until the topic is announced there.
         received: messages taken.
         missed: messages that the publisher had sent before the subscription reached it.
         lost: messages that DDS reported as lost, or that a gap in the publisher's count shows to be.
@@ -54,7 +53,6 @@ class Tap:
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile) -> None:
         self.topic = topic
         self.qos = qos
-        self.topic_id: int | None = None
         self.received = 0
         self.missed = 0
         self.publishers = 1
@@ -158,10 +156,10 @@ def _episode_and_stamp(data: bytes) -> tuple[str, int]:
 
 
 class TapThread:
-    """Empties taps and hands over what came, in the order in which it was received."""
+    """Takes what has come, again and again, and hands it over in the order in which it was received."""
 
-    def __init__(self, taps: Callable[[], Iterable[Tap]], hand_over: Callable[[list[Taken]], None]) -> None:
-        self._taps = taps
+    def __init__(self, take: Callable[[], list[Taken]], hand_over: Callable[[list[Taken]], None]) -> None:
+        self._take = take
         self._hand_over = hand_over
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="taps", daemon=True)
@@ -180,7 +178,7 @@ class TapThread:
         self._look()
 
     def _look(self) -> bool:
-        found = [message for tap in self._taps() for message in tap.take()]
+        found = self._take()
         if found:
             found.sort(key=itemgetter(0))
             self._hand_over(found)
@@ -191,10 +189,13 @@ def message_class(type_name: str) -> Any:
     """The class of a message type such as `sensor_msgs/msg/JointState`.
 
     Raises:
-        ImportError, AttributeError: it is not installed.
+        ValueError: it is not installed, or it is a part of a service or an action.
     """
     package, _, name = type_name.partition("/msg/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise ValueError(f"the message type {type_name} is not installed here: install the package {package}") from None
 
 
 def _never_called(_: Any) -> None:

@@ -21,6 +21,7 @@ from tdof_npid_ros.control.gains import PER_LANE, Gains
 from tdof_npid_ros.graph.alternate_loop import AlternateLoop
 from tdof_npid_ros.graph.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.graph.messages import signal_message
+from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, fastest_executor, number
 from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
@@ -273,6 +274,7 @@ class TunerNode(LoopNode):
 
 def main(args: list[str] | None = None) -> None:
     """Run the node: exit status 0 when finished or interrupted, 2 when it fails."""
+    use_fast_dds_profile()
     rclpy.init(args=sys.argv if args is None else args, signal_handler_options=SignalHandlerOptions.NO)
     try:
         status = _serve(TunerNode())

@@ -30,7 +30,7 @@ from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdow
 from tdof_npid_ros.paper.report import Figure, Finding, Table
 from tdof_npid_ros.paper.tables import COMPARED, ROWS
 from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
-from tdof_npid_ros.tuning.pareto import RATIOS, Front, pareto_front
+from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front
 from tdof_npid_ros.tuning.problem import GENERATIONS
 
 TITLE = "Design of novel TDOF nonlinear PID controllers, reproduced"
@@ -89,6 +89,7 @@ class Reproduction:
 
     Raises:
         OutputError: an unknown table or figure, or no seed.
+        TuningError: what it needs is not installed.
     """
 
     def __init__(self, only: Sequence[str] = (), effort: Effort | None = None) -> None:
@@ -103,6 +104,8 @@ class Reproduction:
         if self.effort.seeds < 1:
             raise OutputError(f"{self.effort.seeds} seeds: at least 1")
         self.names = tuple(name for name in ITEMS if not only or name in only)
+        if self._needs_fronts:
+            check_installed()
         self.rows: Rows = {}
         self.fronts: list[Front] = []
         self.built: dict[str, Table | Figure] = {}
@@ -112,13 +115,12 @@ class Reproduction:
         """What is to be done, in order: each a label and a function.
 
         Args:
-            folder: where the files go; it is claimed by the first job.
+            folder: where the files go; `reproduce` claims it.
         """
         cases = {case for name in self.names for case in ITEMS[name].cases}
-        fronts = any(ITEMS[name].needs_fronts for name in self.names)
         return [
             *(self._row_job(index) for index, row in enumerate(ROWS) if row.case in cases),
-            *(self._front_job(ratio, kind) for ratio in RATIOS for kind in range(len(CONTROLLER_TYPES)) if fronts),
+            *(self._front_job(ratio, kind) for ratio in RATIOS for kind in range(len(CONTROLLER_TYPES)) if self._needs_fronts),
             ("evidence", self._find),
             *((name, lambda name=name: self._build(name, folder)) for name in self.names),
             ("page", lambda: self._write_page(folder)),
@@ -156,6 +158,10 @@ class Reproduction:
                 for controller in COMPARED[1:]
             ],
         }
+
+    @property
+    def _needs_fronts(self) -> bool:
+        return any(ITEMS[name].needs_fronts for name in self.names)
 
     @property
     def _cases(self) -> list[str]:

@@ -30,8 +30,8 @@ def model_parameters(model: str) -> dict[str, float | list[float]]:
     if ":" in model:
         description = load_class(model)
         return {
-            **{name: float(value) for name, value in description.parameters.items()},  # type: ignore[attr-defined]
-            "initial_state": list(map(float, description.initial_state)),  # type: ignore[attr-defined]
+            **{name: float(value) for name, value in description.parameters.items()},
+            "initial_state": list(map(float, description.initial_state)),
             "substeps": 1.0,
         }
     if model not in MODELS:
@@ -48,7 +48,7 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     p = {name: _typed(name, values.get(name, default), default) for name, default in model_parameters(model).items()}
     if ":" in model:
         initial_state, substeps = p.pop("initial_state"), p.pop("substeps")
-        return Ode(load_class(model), p, tuple(initial_state), int(substeps))
+        return Ode(load_class(model), p, tuple(initial_state), substeps)
     if model == "sprott":
         return Sprott(p["a"], p["b"], p["c"], tuple(p["initial_state"]))
     if model == "transfer_function":

@@ -82,8 +82,7 @@ def _sample(
     with _PRECISION, mpmath.workdps(DIGITS):
         period, late = mpmath.mpf(period_ns) / 10**9, mpmath.mpf(late_ns) / 10**9
         a, b = _observable_form(numerator, denominator)
-        _, gamma_new = _hold(a, b, period - late)
-        phi_rest, _ = _hold(a, b, period - late)
+        phi_rest, gamma_new = _hold(a, b, period - late)
         _, gamma_late = _hold(a, b, late)
         phi, _ = _hold(a, b, period)
         gamma_old = phi_rest * gamma_late

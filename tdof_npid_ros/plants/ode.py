@@ -51,13 +51,13 @@ class Ode:
         PlantError: the class lacks a part, or its functions do not compile or return the wrong shape.
     """
 
-    def __init__(self, description: type, values: Mapping[str, float], initial_state: tuple[float, ...], substeps: int):
-        if substeps < 1:
-            raise PlantError(f"substeps is {substeps}: the integration takes at least 1 step a sample")
+    def __init__(self, description: type, values: Mapping[str, float], initial_state: tuple[float, ...], substeps: float):
+        if substeps < 1 or substeps != int(substeps):
+            raise PlantError(f"substeps is {substeps:g}: the integration takes a whole number of steps a sample, 1 or more")
         self.description = description
         self.values = tuple(float(value) for value in values.values())
         self.initial_state = _state(initial_state, len(initial_state))
-        self.substeps = substeps
+        self.substeps = int(substeps)
         self._derivative = _compiled(description.derivative)  # type: ignore[attr-defined]
         self._output = _compiled(description.output)  # type: ignore[attr-defined]
         self._try_out()
@@ -73,16 +73,22 @@ class Ode:
             slope = self._derivative(self.initial_state, 0.0, 0.0, self.values)
             y = self._output(self.initial_state, self.values)
         except numba.core.errors.NumbaError as error:
-            raise PlantError(f"{name} does not compile: {str(error).strip().splitlines()[-1]}") from error
+            raise PlantError(f"{name} does not compile: {_reason(error)}") from error
+        except TypeError as error:
+            raise PlantError(
+                f"{name}: {error}: derivative(x, u, d, p) and output(x, p) must be static methods"
+            ) from error
         if not isinstance(slope, tuple) or len(slope) != len(self.initial_state):
             raise PlantError(
                 f"{name}.derivative returns {slope!r}: it must be a tuple of {len(self.initial_state)} numbers"
             )
         if not all(isinstance(value, float) for value in (*slope, y)):
             raise PlantError(f"{name}: derivative and output must return floats, not {slope!r} and {y!r}")
+        if not all(map(math.isfinite, (*slope, y))):
+            raise PlantError(f"{name}: in its initial state dx/dt is {slope!r} and y is {y!r}: they must be finite")
 
 
-def load_class(path: str) -> type:
+def load_class(path: str) -> Any:
     """The class that `model: package.module:Class` names.
 
     Raises:
@@ -90,15 +96,34 @@ def load_class(path: str) -> type:
     """
     module_name, _, class_name = path.partition(":")
     try:
-        found = getattr(importlib.import_module(module_name), class_name)
+        found: Any = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
         raise PlantError(
             f"model {path!r} cannot be loaded ({error}): is its package installed or on PYTHONPATH?"
         ) from error
+    except Exception as error:  # the user's code: whatever goes wrong in it
+        raise PlantError(f"model {path!r} cannot be loaded: {type(error).__name__}: {error}") from error
     missing = [name for name in ("parameters", "initial_state", "derivative", "output") if not hasattr(found, name)]
-    if not inspect.isclass(found) or missing:
+    is_class = inspect.isclass(found)
+    if not is_class or missing:
         raise PlantError(f"model {path!r} is not a plant class: it lacks {', '.join(missing) or 'being a class'}")
+    if not isinstance(found.parameters, Mapping) or not all(map(_is_number, found.parameters.values())):
+        raise PlantError(f"{path}.parameters is {found.parameters!r}: it must map names to finite numbers")
+    if not isinstance(found.initial_state, (tuple, list)) or not all(map(_is_number, found.initial_state)):
+        raise PlantError(f"{path}.initial_state is {found.initial_state!r}: it must be a tuple of finite numbers")
     return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _reason(error: Exception) -> str:
+    """Of all that Numba says of a failure: what is wrong, and in which line of the user's file."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    what = [line for line in lines if line and not line.startswith(("Failed in", "During:", "File ", "- ", "<"))]
+    where = [line.removesuffix(":") for line in lines if line.startswith("File ")]
+    return "; ".join(what[:1] + where[-1:])
 
 
 def _state(values: Any, length: int) -> tuple[float, ...]:

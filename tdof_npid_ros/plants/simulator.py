@@ -44,6 +44,11 @@ class PlantSimulator:
         self.output = np.zeros(self.lanes)
         kernel_for(self._sampled, output_lanes)(self._sampled, self._like, self._x, self.output)
 
+    def warm_up(self) -> None:
+        """Compile what a step needs, so that no step waits for it; the plant is at its initial state again."""
+        self.advance(np.zeros(self.lanes), np.zeros(self.lanes))
+        self.reset()
+
     def advance(self, effort: np.ndarray, disturbance: np.ndarray) -> None:
         """One step on, under `effort` and `disturbance`, (lanes,) each, held."""
         self._advance_lanes(

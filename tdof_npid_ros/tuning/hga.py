@@ -33,7 +33,7 @@ from tdof_npid_ros.tuning.quadratic import coefficients, model_step
 MIN_EXPLORATION = 2
 """Generations of HGA before each polish, at least: the random population and its offspring."""
 
-KEPT_PER_COEFFICIENT = (2.5, 3.5, 4.5)
+KEPT_PER_COEFFICIENT = (2.5, 3.5, 6.0)
 """Points kept for each coefficient of the quadratic: first round, second, all later. More is slower and surer."""
 
 TRUST_RADIUS = 1.5

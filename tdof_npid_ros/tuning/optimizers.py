@@ -117,7 +117,10 @@ class Cmaes(_Replayed):
         self._unit = self._restarted()
 
     def _restarted(self) -> Array:
-        import cma
+        try:
+            import cma
+        except ImportError:
+            raise TuningError("cmaes needs cma: pip install 'tdof_npid_ros[paper]', or pip install cma") from None
 
         self._restarts += 1
         options = {

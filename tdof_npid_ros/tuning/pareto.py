@@ -25,6 +25,8 @@ RATIOS = (0.1, 0.5, 1.0)  # L/T of Figure 6
 POPULATION = 96  # whole blocks of the compiled loop
 GENERATIONS = 200
 
+PYMOO_NSGA2 = "pymoo.algorithms.moo.nsga2"
+
 TIME_CONSTANT = 1.0  # s, T
 SAMPLES_PER_DEAD_TIME = 100
 SETTLED_AFTER = 8.0  # s beyond 14 dead times: the episode's length
@@ -141,8 +143,10 @@ def pareto_front(
     """
     if seed < 0 or population < 4 or generations < 1:
         raise TuningError(f"seed {seed}, population {population}, generations {generations}: at least 0, 4 and 1")
+    check_installed()
     nsga2, problems, optimize, callback = (
-        _pymoo(name) for name in ("algorithms.moo.nsga2", "core.problem", "optimize", "core.callback")
+        importlib.import_module(name)
+        for name in (PYMOO_NSGA2, "pymoo.core.problem", "pymoo.optimize", "pymoo.core.callback")
     )
     case = foptd_case(ratio)
     problem = TuningProblem(case, controller)
@@ -177,8 +181,9 @@ def dominated_share(front: Front, other: Front) -> float:
     return float(np.mean(np.any(beats, axis=1)))
 
 
-def _pymoo(module: str) -> Any:
+def check_installed() -> None:
+    """Raise TuningError, with the remedy, if pymoo is not installed."""
     try:
-        return importlib.import_module(f"pymoo.{module}")
+        importlib.import_module(PYMOO_NSGA2)
     except ImportError:
-        raise TuningError("NSGA-II needs pymoo: pip install 'tdof-npid-ros[paper]', or pip install pymoo") from None
+        raise TuningError("NSGA-II needs pymoo: pip install 'tdof_npid_ros[paper]', or pip install pymoo") from None

@@ -16,6 +16,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from tdof_npid_ros.analysis import AnalysisError
+from tdof_npid_ros.analysis.episodes import bag_names
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import Case, load_case
@@ -135,6 +136,22 @@ def test_two_bags_are_compared(bag, tmp_path, case, capsys) -> None:
     assert change == pytest.approx(100 * (case.setpoint_response(pid).iae / case.setpoint_response().iae - 1))
     assert main(["analyze", str(bag), str(tmp_path / "other")]) == 0
     assert "ΔIAE" in capsys.readouterr().out
+    assert main(["analyze", str(bag), str(tmp_path / "other"), "--json"]) == 0
+    responses = [e["lanes"][0]["responses"][0] for e in json.loads(capsys.readouterr().out)["episodes"]]
+    assert [response["iae_change_percent"] for response in responses] == [None, None, change]
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["runs/a"], [""]),
+        (["runs/a", "runs/b"], ["a", "b"]),
+        (["monday/run/bag", "tuesday/run/bag"], ["monday/run/bag", "tuesday/run/bag"]),
+        (["runs/a", "runs/a/"], ["", ""]),
+    ],
+)
+def test_bags_are_told_apart_by_the_ends_of_their_paths(paths, names) -> None:
+    assert bag_names(paths) == dict(zip(paths, names, strict=True))
 
 
 def test_a_loop_in_a_namespace(tmp_path, case) -> None:
@@ -204,6 +221,7 @@ def test_files_and_json(bag, tmp_path, capsys, case) -> None:
     rows = list(csv.DictReader(files["csv"].open()))
     assert float(rows[0]["iae"]) == case.setpoint_response().iae
     page = files["html"].read_text()
+    assert f'<td class="number">{case.gains.kp:.6g}</td>' in page
     assert not re.search(r"(src|href)=|https?://|@import", page), "the page must need nothing else"
     curves = json.loads(re.search(r"const PLOTS = (.*);\n", page).group(1))
     data = np.frombuffer(base64.b64decode(curves[0]["curves"][0]["output"]["data"]))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -220,6 +222,38 @@ def test_every_operation_has_a_name_of_its_own() -> None:
         parameters_digest(GAINS, PERIOD_NS, o) for o in (PLAIN, Operation(dead_band=0.1), Operation(manual=True))
     }
     assert len(digests) == 3
+
+
+ANSWERS_OF_ALL_KINDS = """
+import numpy as np
+from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.law import answer_lanes
+from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.control.shaping import shape_lanes
+
+def compiled():
+    return len(answer_lanes.signatures), len(shape_lanes.signatures)
+
+controller, y = Controller(Gains(kp=2.0, ki=1.0, kd=0.1), 10_000_000), np.zeros(1)
+controller.warm_up()
+before = compiled()
+assert before == (1, 1) and controller.stamp_ns is None
+controller.answer(0, y, y)
+controller.change_gains(Gains(type="pid", kp=3.0, ki=1.0, kd=0.1))
+controller.answer(1, y, y)
+controller.begin_within(y + 1.0)
+controller.answer(2, y, y)
+controller.change(Gains(kp=2.0, ki=1.0), Operation(setpoint_rate=1.0, effort_rate=2.0))
+controller.answer(3, y, y)
+controller.change(Gains(kp=2.0, ki=1.0), Operation(manual=True))
+controller.answer(4, y, y)
+assert compiled() == before
+"""
+
+
+def test_nothing_is_compiled_while_the_loop_runs() -> None:
+    subprocess.run([sys.executable, "-c", ANSWERS_OF_ALL_KINDS], check=True)
 
 
 @pytest.mark.parametrize("kind", CONTROLLER_TYPES)

@@ -79,7 +79,6 @@ class Hosts:
         environment = {
             **os.environ,
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "config" / "lossy-network.xml"),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
             "PYTHONPATH": str(REPOSITORY),
         }

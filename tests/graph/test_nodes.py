@@ -107,6 +107,27 @@ def test_controller_killed_and_restarted(graph: Any) -> None:
     graph.wait_until(lambda: int(graph.fact("/plant", "steps")) > before + 100, 60, "more steps")
 
 
+def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None:
+    """The plant may be found after the controller has answered it; then it waits for that answer."""
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory
+
+    from tdof_npid_ros.graph.messages import plan_message
+    from tdof_npid_ros.graph.node import LATCHED_QOS
+
+    graph.start("controller")
+    plan = load_case("p1-c0.5").plans["setpoint"]
+    graph.publisher("scenario_plan", JointTrajectory, LATCHED_QOS).publish(plan_message(plan, 0))
+    output = JointState(position=[0.25])
+    output.header.frame_id = f"{plan.digest}/1"
+    graph.publisher("output", JointState).publish(output)
+    graph.wait_until(lambda: graph.fact("/controller", "steps") == "1", what="an answer that nobody hears")
+    efforts = graph.collect("control_effort", JointState)
+    graph.wait_until(lambda: efforts, what="the same answer")
+    assert efforts[0].header.frame_id.endswith(output.header.frame_id)
+    assert list(efforts[0].position) == [1.0]
+
+
 @pytest.mark.parametrize(
     ("node", "parameters", "reason"),
     [

@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "analysis"))
-from loop_bags import LoopBag
+from loop_bags import JOINT_STATE, STEP_NS, LoopBag, joint_state
 
+from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import load_case
+from tdof_npid_ros.control.controller import Controller
 
 CASE = dataclasses.replace(load_case("p1-c0.5"), episodes={"setpoint": ("0 setpoint 1", "1 end")})
 
@@ -56,6 +59,71 @@ def test_start_and_namespace_and_clock(graph: Any, bag: Path) -> None:
     graph.wait_until(lambda: len(outputs) > 2 and clock, 60, "outputs and clock")
     assert outputs[0].header.stamp.nanosec >= 0.4e9 and time.monotonic() > began
     replay.stop()
+
+
+def test_rate_and_loop(graph: Any, bag: Path) -> None:
+    """Not faster than asked for, and from the beginning again."""
+    from sensor_msgs.msg import JointState
+
+    arrivals: list[tuple[float, int]] = []
+
+    def on_output(message: JointState) -> None:
+        arrivals.append((time.monotonic(), message.header.stamp.sec * 10**9 + message.header.stamp.nanosec))
+
+    def rounds() -> list[int]:
+        return [i for i in range(1, len(arrivals)) if arrivals[i][1] < arrivals[i - 1][1]]
+
+    graph.node.create_subscription(JointState, "output", on_output, 10_000)
+    replay = graph.start("replay", bag=str(bag), rate=0.05, loop=True)
+    graph.wait_until(lambda: len(rounds()) == 3, 60, "three rounds")
+    begin, end = rounds()[0], rounds()[1] - 1
+    assert [stamp for _, stamp in arrivals[begin : end + 1]] == list(range(0, 10**9 + 1, CASE.sample_period_ns))
+    recorded = 2 * 200 * STEP_NS / 1e9  # s; an answer lies between two outputs
+    assert arrivals[end][0] - arrivals[begin][0] > 0.9 * recorded / 0.05
+    replay.stop()
+
+
+def test_a_start_after_the_end_is_refused(graph: Any, bag: Path) -> None:
+    replay = graph.start("replay", bag=str(bag), start=10.0)
+    wait_for_end(graph, replay, 2)
+    assert "nothing in it after 10 s: it lasts 0.04" in replay.log
+
+
+def test_a_type_that_is_not_installed_is_left_out(graph: Any, bag: Path, tmp_path: Path) -> None:
+    with BagReader(bag) as reader, BagWriter(tmp_path / "more") as writer:
+        output = writer.add_topic("/output", JOINT_STATE)
+        foreign = writer.add_topic("/gripper", "robot_msgs/msg/Grip", definition="float64 force", type_hash="")
+        for _, log_time, publish_time, data in reader.messages(["/output"]):
+            writer.write(output, data, log_time, publish_time)
+            writer.write(foreign, bytes(12), log_time, publish_time)
+    replay = graph.start("replay", bag=str(tmp_path / "more"))
+    wait_for_end(graph, replay, 0)
+    assert "/gripper is not replayed: the message type robot_msgs/msg/Grip is not installed" in replay.log
+
+
+def test_a_robots_joint_states_are_given_to_the_controller(graph: Any, tmp_path: Path) -> None:
+    """Its frame is no episode, and its outputs have another topic."""
+    controller = Controller(CASE.gains, CASE.sample_period_ns)
+    with LoopBag(tmp_path / "robot") as writer:
+        writer.configuration(CASE, CASE.gains)
+        for k in range(100):
+            stamp, y = k * CASE.sample_period_ns, np.array([np.sin(k / 30)])
+            controller.answer(stamp, np.zeros(1), y)
+            writer.write("joint_states", JOINT_STATE, joint_state(stamp, "base_link", y))
+            answer = joint_state(stamp, controller.digest, [0.0], controller.effort)
+            writer.write("control_effort", JOINT_STATE, answer)
+    graph.start("controller", "-r", "output:=joint_states", case="p1-c0.5")
+    replay = graph.start("replay", bag=str(tmp_path / "robot"), compare=True)
+    wait_for_end(graph, replay, 0)
+    assert "100 control efforts equal bit for bit, 0 differ" in replay.log
+
+
+def test_nothing_compared_is_no_success(graph: Any, bag: Path) -> None:
+    """After the last answer there is nothing to wait for."""
+    graph.start("controller", case="p1-c0.5")
+    replay = graph.start("replay", bag=str(bag), compare=True, start=(2 * 201 + 3) * STEP_NS / 1e9)
+    wait_for_end(graph, replay, 1)
+    assert "nothing was compared" in replay.log
 
 
 def test_the_same_controller_gives_the_recorded_efforts(graph: Any, bag: Path) -> None:

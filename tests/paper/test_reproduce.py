@@ -131,7 +131,7 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
         claim_folder(tmp_path / "file", "reproduce")
 
 
-@pytest.mark.parametrize("arguments", [["--only", "table99"], ["--seeds", "0"]])
+@pytest.mark.parametrize("arguments", [["--only", "table99"], ["--only", ","], ["--seeds", "0"]])
 def test_bad_arguments_are_refused_before_anything_is_written(arguments: list[str], tmp_path: Path) -> None:
     assert main(["reproduce", "--out", str(tmp_path / "out"), *arguments]) == 2
     assert not (tmp_path / "out").exists()

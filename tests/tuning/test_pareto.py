@@ -103,7 +103,12 @@ def test_the_fronts_are_written_as_data_and_picture(tmp_path: Path, capsys: pyte
         (["--ratio", "0.5", "--controller", "pd"], "no controller type"),
         (["--ratio", "0.5", "--controller", "pid", "--seed", "-1"], "seed"),
         (["--ratio", "0.5", "--write", "loop.yaml"], "one front"),
-        (["--ratio", "0.5", "--controller", "pid", "--write", "no/folder/loop.yaml"], "no folder"),
+        (["--ratio", "0.5", "--controller", "pid", "--write", "no/folder/loop.yaml"], "cannot be written"),
+        (["--ratio", "0.5", "--controller", "pid", "--generations", "0"], "generations"),
+        (["--ratio", "0.5", "--controller", "pid", "--index", "-1", "--write", "loop.yaml"], "index"),
+        (["--ratio", "0.5", "--controller", "pid", "--weight", "nan", "--write", "loop.yaml"], "weight"),
+        (["--ratio", "0.5", "--controller", "pid", "--weight", "-1", "--write", "loop.yaml"], "weight"),
+        (["--ratio", "0.5", "--controller", "pid", "--index", "1"], "--write"),
         (
             ["--ratio", "0.5", "--controller", "pid", "--generations", "1", "--write", "loop.yaml", "--index", "999"],
             "no point",
@@ -135,6 +140,16 @@ def test_without_pymoo_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "pymoo.algorithms.moo.nsga2", None)
     with pytest.raises(TuningError, match="pip install"):
         pareto_front(RATIO, "pid")
+
+
+@pytest.mark.parametrize("subcommand", ["pareto", "reproduce"])
+def test_without_pymoo_nothing_is_begun(
+    subcommand: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pymoo.algorithms.moo.nsga2", None)
+    assert main([subcommand, "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_loop_of_a_ratio_has_its_dead_time() -> None:

@@ -130,6 +130,21 @@ def test_bad_input_is_refused_in_one_line(arguments: list[str], told: str, capsy
     assert told in refused(capsys, *arguments)
 
 
+def test_without_cma_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, "cma", None)
+    assert "pip install" in refused(capsys, *QUICK, "--controller", "pid", "--algorithm", "cmaes")
+
+
+def test_episodes_without_metrics_are_refused_before_the_search(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = tmp_path / "case.yaml"
+    text = (config_folder() / "p3-c1.yaml").read_text()
+    case.write_text(text.replace('setpoint: ["0 setpoint 1"', 'setpoint: ["5 setpoint 1"'))
+    assert "changes after 0 s" in refused(capsys, str(case), "--controller", "pid", "--out", str(tmp_path / "out.yaml"))
+    assert not (tmp_path / "out.yaml").exists()
+
+
 def test_reversed_bounds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (config_folder() / "p3-c1.yaml").read_text()
     case = tmp_path / "mine.yaml"
