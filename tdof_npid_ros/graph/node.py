@@ -66,7 +66,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             )
         )
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer, clock=STEADY)
 
     # What a subclass fills in
 

@@ -29,7 +29,7 @@ from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.messages import set_stamp, signal_message
-from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread, message_class
 
@@ -88,18 +88,24 @@ class RecorderNode(LoopNode):
             "lossless", False, "tell the plant on `recorded` how far the log is; the plant needs it, too", fixed=True
         )
         self.accept_changes()
-        self.failure = ""
+        self._begin_account()
         self.taps: dict[str, Tap] = {}
+        self.writer = self._open() if self.autostart else None
+
+    def _begin_account(self) -> None:
+        """Each bag has its own."""
+        self.failure = ""
+        self.counts["recorded"] = 0
         self.topic_ids: dict[str, int] = {}  # in the bag
         self.left: list[Taken] = []  # by taps that were closed
         self.lost_by_topic: Counter[str] = Counter()  # on taps that were closed
         self.missed_by_topic: Counter[str] = Counter()  # published before the recorder came
         self.not_recorded: set[str] = set()
-        self.writer = self._open() if self.autostart else None
 
     def activate(self) -> None:
         """Open the bag and subscribe."""
         self.writer = self.writer or self._open()
+        self._begin_account()
         self.lock = threading.Lock()  # of what this thread and that of the taps share: taps, topic_ids, left
         self.snapshots = ParameterSnapshots(self, self._write_snapshot)
         self.graph: object = None
@@ -112,7 +118,7 @@ class RecorderNode(LoopNode):
             self.progress = LogProgress([self.resolve_topic_name(name) for name in ("output", "control_effort")])
             self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
         self.thread = TapThread(self._take, self._write)
-        self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=STEADY)
         self.get_logger().info(f"recording to {self.folder}")
         self._look()
 

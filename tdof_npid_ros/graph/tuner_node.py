@@ -193,7 +193,7 @@ class TunerNode(LoopNode):
             if self.study.done and self.step_test is None:
                 self._confirm()
         finally:
-            self.stop_at_once = False
+            self.stop_requested = self.stop_at_once = False
             self.evaluator.leave(self.study.result.gains if self.study.generation else None)
         if self.study.done:
             self._write_result()
@@ -207,8 +207,8 @@ class TunerNode(LoopNode):
         self.stop_requested = True
 
     def check_interrupted(self) -> None:
-        """Raise InterruptedTuningError if asked to stop at once."""
-        if self.stop_at_once:
+        """Raise InterruptedTuningError if asked to stop at once, or to stop and no loop is left to end the generation."""
+        if self.stop_at_once or (self.stop_requested and self.activated.is_set() and not self.evaluator.in_use):
             raise InterruptedTuningError(self._interrupted())
 
     def _after_generation(self, study: Study) -> bool:

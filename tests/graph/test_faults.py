@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import os
 import random
+import shutil
 import signal
+import struct
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +19,7 @@ import pytest
 from test_operation import CONTROLLER, PLANT, Live
 
 from tdof_npid_ros.analysis.verify import verify
+from tdof_npid_ros.graph.node import as_float
 
 BOUND = 0.5  # of the setpoint: how far the output may go in any of these faults, but for the loss of the plant itself
 JUMP = 0.25  # largest step of the effort between two samples while parameters change at random
@@ -258,6 +262,7 @@ def test_random_parameters_of_every_node_are_accepted_or_refused_whole(graph: An
         after = graph.get_parameters(name, *names)
         for one, was, now in zip(names, before, after, strict=True):
             expected = changes[one] if result.successful and one in changes else was
+            expected = as_float(expected) if isinstance(was, float) else expected  # 3 is taken as 3.0
             assert same(now, expected), (changes, one, was, now, process.log)
         assert result.successful or result.reason
 
@@ -295,6 +300,34 @@ def test_a_clock_that_is_set_back_or_forward(live: Live) -> None:
     back = [answer(now - 3600 + 0.01 * k) for k in range(10)]
     forward = [answer(now + 3600 + 0.01 * k) for k in range(10)]
     assert max(abs(np.diff([*steady, *back, *forward]))) < JUMP + 0.1
+
+
+@pytest.mark.parametrize("step", [3600, -3600])
+def test_a_wall_clock_that_is_set_moves_nothing(graph: Any, tmp_path: Path, step: int) -> None:
+    """The nodes' wall clock is set by an hour while the loop runs; they live by the steady clock."""
+    compiler, library, offset = shutil.which("cc"), tmp_path / "wall_clock.so", tmp_path / "offset"
+    if compiler is None:
+        pytest.skip("a C compiler is needed to give the nodes another wall clock")
+    source = Path(__file__).with_name("wall_clock.c")
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
+    offset.write_bytes(struct.pack("=q", 0))
+    graph.environment |= {"LD_PRELOAD": str(library), "WALL_CLOCK_OFFSET": str(offset)}
+    live = Live(graph, "/clock", {"fallback": "hold"}, {})
+    live.settle()
+    live.settle()
+    names = (live.plant_name, live.controller_name)
+    silences = [graph.fresh_fact(name, "silences", 0) for name in names]
+    first, jumps_from, set_ns = len(live.outputs), len(live.efforts), time.time_ns()
+    with offset.open("r+b") as stream:
+        stream.write(struct.pack("=q", step))
+    for name in names:  # until their reports bear the other time
+        graph.wait_until(lambda n=name: abs(graph.fact(n, "stamp_ns") - set_ns - step * 10**9) < 60 * 10**9, 30)
+    live.settle()
+    live.settle()
+    assert excursion(live, first) < 0.05
+    assert np.max(np.abs(np.diff([m.effort[0] for m in live.efforts[jumps_from:]]))) < 0.05
+    assert [graph.fact(name, "silences", 0) for name in names] == silences
+    assert graph.set_parameters(live.controller_name, kp=3.0)[0].successful
 
 
 def test_a_killed_plant_that_is_started_again(live: Live) -> None:

@@ -169,6 +169,34 @@ def test_topics_that_appear_later_and_best_effort_ones(graph: Any, tmp_path: Pat
         assert reader.topics["/output"].count >= 1
 
 
+def test_a_supervisor_records_bag_after_bag(graph: Any, tmp_path: Path) -> None:
+    graph.start("plant", mode="realtime")
+    graph.start("controller")
+    graph.start("recorder", autostart=False, bag=str(tmp_path / "bag0"))
+    graph.wait_for_nodes("/plant", "/controller", "/recorder")
+    assert graph.change_state("/recorder", "configure")
+    for number in range(3):
+        assert graph.set_parameters("/recorder", bag=str(tmp_path / f"bag{number}"))[0].successful
+        assert graph.change_state("/recorder", "activate")
+        assert not graph.set_parameters("/recorder", bag=str(tmp_path / "other"))[0].successful
+        graph.wait_for_nodes("/recorder")
+        graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > 200, what="messages to be recorded")
+        assert graph.change_state("/recorder", "deactivate")
+    for number in range(3):
+        with BagReader(tmp_path / f"bag{number}") as reader:
+            total = sum(topic.count for topic in reader.topics.values())
+            assert (
+                reader.custom_data["recorded"] == str(total - snapshots(reader)) and reader.custom_data["lost"] == "0"
+            )
+            assert reader.topics["/output"].count > 50
+        assert verify(tmp_path / f"bag{number}").different == 0
+
+
+def snapshots(reader: BagReader) -> int:
+    """Parameters that the recorder asked for itself: they are in the bag, but did not arrive on a topic."""
+    return sum(len(row) > 1 for row in reader.columns("/parameter_events")["new_parameters"])
+
+
 def test_a_bag_is_never_overwritten(graph: Any, tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
