@@ -10,6 +10,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -33,7 +34,7 @@ class Conductor:
 
     def __init__(self, namespace: str, check: Callable[[], None]) -> None:
         use_fast_dds_profile()
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # else Ctrl-C would end the context under our feet
         self._node = rclpy.create_node("conductor", namespace=namespace, start_parameter_services=False)
         self._check = check
         self._facts: dict[str, dict[str, str]] = {}

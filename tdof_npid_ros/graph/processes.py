@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,6 +19,22 @@ STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
 
 class NodeProcessError(RuntimeError):
     """A node that could not be started or has ended; the message shows the end of its log."""
+
+
+@contextmanager
+def _interrupted_afterwards() -> Iterator[None]:
+    """Let Ctrl-C wait until this is done: a process that has been started but is not noted yet would never be stopped."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupts:
+        raise KeyboardInterrupt
 
 
 class NodeProcesses:
@@ -39,7 +57,7 @@ class NodeProcesses:
         command += ["--params-file", str(self._parameter_file)]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
-        with self.log(node).open("wb") as log:
+        with self.log(node).open("wb") as log, _interrupted_afterwards():
             # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
             self._processes[node] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

@@ -16,7 +16,7 @@ from loop_bags import LoopBag
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.graph.__main__ import NODES
-from tdof_npid_ros.graph.recorder_node import EXPECTED
+from tdof_npid_ros.graph.recorder_node import EXPECTED as EXPECTED_BY_RECORDER
 
 OWN_PARAMETERS = {"/parameter_events"}  # every node may listen to its own clock parameter; not all versions of rclpy do
 # Ways to run a node that, together, use all that its policy allows. BAG is a bag that the test makes.
@@ -30,6 +30,7 @@ WAYS: dict[str, list[dict[str, Any]]] = {
     "replay": [{"bag": "BAG", "rate": 1e-4, "clock": True}, {"bag": "BAG", "compare": True}],
 }
 CASE = dataclasses.replace(load_case("p1-c0.5"), episodes={"setpoint": ("0 setpoint 1", "1 end")})
+EXPECTED = {name.lstrip("/") for name in EXPECTED_BY_RECORDER}
 RECORDED = {
     "control_effort",
     "setpoint",
@@ -49,7 +50,9 @@ def allowed(node: str, kind: str, action: str) -> set[str]:
 
 
 def endpoints(graph: Any, node: str, namespace: str) -> dict[str, set[str]]:
-    """The names that a node in a namespace has, as if it were in the root namespace."""
+    """The names that a node in a namespace has, as if it were in the root namespace; none before it is discovered."""
+    if (node, namespace) not in graph.node.get_node_names_and_namespaces():
+        return {action: set() for action in ("publish", "subscribe", "reply", "request")}
     found = {
         "publish": graph.node.get_publisher_names_and_types_by_node(node, namespace),
         "subscribe": graph.node.get_subscriber_names_and_types_by_node(node, namespace),
