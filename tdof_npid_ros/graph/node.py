@@ -32,6 +32,7 @@ RECENT = 20  # messages that wait for a late reader: enough that none is lost, t
 RECENT_QOS = signal_qos(RECENT)
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
+REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -50,6 +51,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def __init__(self, name: str) -> None:
         self._activating = False
+        self._activation = 0  # how often it has been activated
+        self.leftovers: list[Callable[[], None]] = []  # how to destroy what ended activations have left
         self._defaults: dict[str, Any] = {}
         super().__init__(name)
         self.counts: Counter[str] = Counter()
@@ -102,7 +105,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         events = self.endpoints.subscription_events(topic, sole)
         self.create_subscription(message_type, topic, callback, qos, event_callbacks=events)
 
-    # What `activate` creates is destroyed by a transition, yet an executor may hold a call of it that was due before.
+    # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due before.
 
     def create_subscription(
         self, message_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
@@ -122,9 +125,13 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         if not self._activating:
             return callback
 
+        activation = self._activation
+
         @functools.wraps(callback)  # rclpy looks at the signature
         def guarded(*args: Any) -> Any:
-            return callback(*args) if self.active else args and args[-1]  # for a service: its response, as it was
+            if self.active and self._activation == activation:
+                return callback(*args)
+            return args and args[-1]  # for a service: its response, as it was
 
         return guarded
 
@@ -220,12 +227,13 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         """Begin to work."""
         self._lasting = [id(entity) for _, entity in self._entities()]
         self._activating = True
+        self._activation += 1
         try:
             self.activate()
         except (ValueError, OSError, RuntimeError) as error:
             self.activation_error = error
             self.get_logger().error(f"not activated: {error}")
-            self._destroy_what_activate_created()
+            self._leave_what_activate_created()
             return TransitionCallbackReturn.FAILURE
         finally:
             self._activating = False
@@ -248,7 +256,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         if self.active:
             self.active = False
             self.deactivate()
-            self._destroy_what_activate_created()
+            self._leave_what_activate_created()
         self.publish_diagnostics()
 
     def _entities(self) -> list[tuple[Callable[[Any], bool], Any]]:
@@ -260,11 +268,21 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             *((self.destroy_timer, timer) for timer in self.timers),
         ]
 
-    def _destroy_what_activate_created(self) -> None:
-        for destroy, entity in self._entities():
+    def _leave_what_activate_created(self) -> None:
+        """Take it out of the node, so that the executor lets go of it, and leave it to `spin` to destroy it.
+
+        See `_destroy_leftovers`.
+        """
+        for take_out_and_destroy, entity in self._entities():
             if id(entity) not in self._lasting:
-                destroy(entity)
+                self.leftovers.append(entity.destroy)
+                entity.destroy = _do_nothing
+                take_out_and_destroy(entity)
         self.endpoints.forget()
+
+
+def _do_nothing() -> None:
+    pass
 
 
 def plain(value: Any) -> Any:
@@ -376,27 +394,57 @@ class Stop:
     def _wait(self) -> None:
         self._reader.recv(1)
         self.requested = True
-        if self._wake is not None:
-            self._wake()
+        wake = self._wake
+        if wake is not None:
+            wake()
 
     def ignore_further(self) -> None:
         """For the end of the process, also while the interpreter shuts down."""
         for number_ in STOP_SIGNALS:
             signal.signal(number_, signal.SIG_IGN)
 
-    def wakes(self, executor: Any) -> None:
-        """Wake this executor when the signal comes."""
-        self._wake = executor.wake
+    def wakes(self, executor: Any | None) -> None:
+        """Wake this executor, or none, when the signal comes."""
+        self._wake = executor and executor.wake
 
 
 def spin(node: LoopNode, stop: Stop | None = None) -> None:
     """Serve a node until it is to stop, or until its context is shut down."""
+    while rclpy.ok() and not (stop and stop.requested):
+        _spin_until_leftovers(node, stop)
+        if node.leftovers:
+            _destroy_leftovers(node)
+
+
+def _spin_until_leftovers(node: LoopNode, stop: Stop | None) -> None:
     executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
     executor.add_node(node)
     if stop is not None:
         stop.wakes(executor)
-    while rclpy.ok() and not (stop and stop.requested):
+    while rclpy.ok() and not (stop and stop.requested) and not node.leftovers:
         executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+    if stop is not None:
+        stop.wakes(None)
+    executor.remove_node(node)
+    executor.shutdown()
+
+
+def _destroy_leftovers(node: LoopNode) -> None:
+    """Destroy what a transition has left, between two executors.
+
+    The events executor ends the process over an event of something that is destroyed (ros2/rclpy issue 1644), also over
+    one that came before. What the node has heard of but not served yet, a request for one, would be lost with it; so
+    an executor that looks at what is there, not at events, serves that meanwhile.
+    """
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    for _ in range(REQUESTS_AT_ONCE):
+        executor.spin_once(timeout_sec=0.0)
+    for destroy in node.leftovers:
+        destroy()
+    node.leftovers = []
+    executor.remove_node(node)
+    executor.shutdown()
 
 
 def fastest_executor() -> Any:

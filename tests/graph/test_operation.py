@@ -203,6 +203,7 @@ def test_deactivating_amid_messages_ends_no_node(graph: Any) -> None:
     for node in (live.controller_name, live.plant_name) * 10:
         assert graph.change_state(node, "deactivate")
         assert graph.change_state(node, "activate")
+        live.wait_for_efforts(50)
     live.settle()
 
 
