@@ -20,8 +20,7 @@ METHOD = (
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
-    "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other, so the loop's steps per second bound "
-    "it; what the tuner does between two episodes takes some 40 ms.",
+    "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second bound it.",
 )
 
 NAMESPACE = "/bench_tuning"
