@@ -24,6 +24,7 @@ from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.messages import (
     NO_VALUES,
+    all_within,
     as_field,
     lane_names,
     plan_from_message,
@@ -90,6 +91,7 @@ class ControllerNode(LoopNode):
             gains_from_mapping(given), sample_period_in_ns(period), operation_from_mapping(given)
         )
         self.controller.warm_up()
+        all_within(np.zeros(1), LARGEST_SIGNAL)  # compiles, too
         self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
         if self.joints.names and len(self.joints.names) != self.controller.lanes:
             raise ValueError(
@@ -286,7 +288,7 @@ class ControllerNode(LoopNode):
         lanes = self.controller.lanes
         if len(y) != lanes:
             self.refuse("rejected", "output refused", f": it has {len(y)} values, the gains are for {lanes} lanes")
-        elif not (abs(y[0]) if lanes == 1 else np.abs(y).max()) <= LARGEST_SIGNAL:  # nan is not, either
+        elif not all_within(y, LARGEST_SIGNAL):
             self.refuse("rejected", "output that is not finite refused")
         else:
             return True

@@ -26,7 +26,7 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 
 ATTEMPTS = 5  # at an episode that something else cuts short
 POLL = 0.1  # s between two looks at an episode's progress
-PLAN_DELAY = 0.02  # s until a plan on its way to the plant is asked for again
+PLAN_DELAY = 0.005  # s until a plan on its way to the plant is asked for again
 TUNED_PARAMETERS = ("type", *PER_LANE)
 
 

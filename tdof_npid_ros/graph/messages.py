@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from tdof_npid_ros.compiled import entry_point
 from tdof_npid_ros.scenario import Plan
 
 SECOND = 1_000_000_000  # ns
@@ -38,6 +39,15 @@ def time_message(time_ns: int) -> Time:
 def values(field: array[float]) -> np.ndarray:
     """A message's float64 field as an array that shares its memory."""
     return np.frombuffer(field, dtype=np.float64)
+
+
+@entry_point
+def all_within(values_: np.ndarray, largest: float) -> bool:
+    """Whether every value's magnitude is at most `largest`; that of nan is not."""
+    for value in values_:  # noqa: SIM110  compiled
+        if not abs(value) <= largest:
+            return False
+    return True
 
 
 def as_field(values_: np.ndarray) -> array[float]:

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import as_field, lane_names, set_stamp, signal_message, values
+from tdof_npid_ros.graph.messages import all_within, as_field, lane_names, set_stamp, signal_message, values
 from tdof_npid_ros.graph.node import LoopNode, number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
@@ -56,6 +56,7 @@ class PlantNode(LoopNode):
         self.output = signal_message("")
         self.make_simulator()
         self.simulator.warm_up()
+        all_within(np.zeros(1), sys.float_info.max)  # compiles, too
         self.way_of_running = MODES[self.mode](self)
 
     def _declare_model(self) -> None:
@@ -117,7 +118,7 @@ class PlantNode(LoopNode):
         lanes = self.simulator.lanes
         if len(field) != lanes:
             self.refuse("rejected", f"{topic} refused", f": it has {len(field)} values for {lanes} lanes")
-        elif not (math.isfinite(field[0]) if lanes == 1 else np.isfinite(values(field)).all()):
+        elif not all_within(values(field), sys.float_info.max):
             self.refuse("rejected", f"{topic} that is not finite refused")
         else:
             return True

@@ -38,6 +38,7 @@ def demo(tmp_path: Path) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % DOMAINS)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )
     end = time.monotonic() + START_TIMEOUT
     while len(children_of(program.pid)) < NODES:
