@@ -1,12 +1,13 @@
 """Real nodes as real processes over real DDS, for the tests of the graph.
 
 A test takes the fixture `graph`: a DDS domain of its own, in which it starts nodes and looks on through one node of
-its own. Nothing sleeps for a fixed time: `wait_until` spins until a condition holds. Three things mislead a test that
+its own. Nothing sleeps for a fixed time: `wait_until` spins until a condition holds. Four things mislead a test that
 looks on from outside, and each has its remedy here:
 
 * A message is lost if the other side has not matched yet, and so is an answer to it: `publish_until` repeats it.
 * A line may be in a log already: `expect_log` waits for a further one.
 * A fact of the diagnostics is up to a second old: `fresh_fact` waits for a report that was made after the call.
+* While a test does not spin, messages pile up, and pass for new ones later: `catch_up` takes them first.
 """
 
 from __future__ import annotations
@@ -202,6 +203,11 @@ class Graph:
                 pytest.fail(f"waited {timeout:g} s in vain for {what}\n{logs}\n--- diagnostics: {self.diagnostics}")
             self.spin_once()
         return value
+
+    def catch_up(self) -> None:
+        """Take every message that has arrived: those that come from here on are new."""
+        mark = self._executor.create_task(lambda: None)  # served after what came before
+        self.wait_until(mark.done, what="the messages that have arrived")
 
     def wait_for_log(self, process: NodeProcess, text: str, timeout: float = 20.0) -> None:
         self.wait_until(lambda: text in process.log, timeout, f"{text!r} in the log of {process.node}")
