@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -15,8 +17,9 @@ from trajectory_msgs.msg import JointTrajectory
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_candidates, gains_from_mapping
 from tdof_npid_ros.graph.messages import plan_message, stamp_ns, values
-from tdof_npid_ros.graph.node import LATCHED_QOS, SIGNAL_QOS
+from tdof_npid_ros.graph.node import LATCHED_QOS
 from tdof_npid_ros.graph.remote_node import RemoteNode
+from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
@@ -28,6 +31,7 @@ ATTEMPTS = 5  # at an episode that something else cuts short
 POLL = 0.1  # s between two looks at an episode's progress
 PLAN_DELAY = 0.005  # s until a plan on its way to the plant is asked for again
 TUNED_PARAMETERS = ("type", *PER_LANE)
+OUTPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL)
 
 
 class WrongCaseError(LoopLostError):
@@ -38,7 +42,7 @@ class LoopClient:
     """The plant and the controller of one namespace.
 
     Args:
-        node: through which everything goes; its executor spins in another thread.
+        node: through which everything goes; its executor, which must know callback groups, spins in another thread.
         namespace: of the loop.
         problem: what is tuned.
         answer_timeout: s until a silent loop counts as lost.
@@ -59,11 +63,13 @@ class LoopClient:
         self._outputs: EpisodeOutputs | None = None
         self._ended = threading.Condition()
         self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
-        self._output_subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
+        self._tap = Tap(node, f"{base}/output", "sensor_msgs/msg/JointState", OUTPUT_QOS)
+        self._taps = TapThread(self._tap.take, self._on_outputs)
 
     def destroy(self) -> None:
         """Leave the graph."""
-        self._node.destroy_subscription(self._output_subscription)
+        self._taps.stop()
+        self._tap.close()
         self._node.destroy_publisher(self._plan_publisher)
         self.plant.destroy()
         self.controller.destroy()
@@ -151,11 +157,13 @@ class LoopClient:
                 elif now - moved > self._answer_timeout:
                     raise LoopLostError(f"no new output for {self._answer_timeout:g} s, after {received} of an episode")
 
-    def _on_output(self, message: JointState) -> None:
+    def _on_outputs(self, found: list[Taken]) -> None:
         outputs = self._outputs
         if outputs is None:
             return
-        outputs.take(message.header.frame_id, stamp_ns(message.header.stamp), values(message.position))
+        for taken in found:
+            message = deserialize_message(taken.data, JointState)
+            outputs.take(message.header.frame_id, stamp_ns(message.header.stamp), values(message.position))
         if outputs.complete or outputs.cut:
             with self._ended:
                 self._ended.notify()

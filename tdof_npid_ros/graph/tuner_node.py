@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Protocol
 
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
@@ -53,7 +54,7 @@ class Evaluator(Protocol):
         ...
 
     def leave(self, gains: Gains | None) -> None:
-        """Set these gains, or those before the tuning."""
+        """Set these gains, or those before the tuning; nothing is evaluated after that."""
         ...
 
 
@@ -317,7 +318,8 @@ def _serve(node: TunerNode) -> int:
 
 
 def _spin(node: TunerNode, ended: threading.Event) -> None:
-    executor = fastest_executor()
+    """Serve the node's services and timers; outputs of loops in lockstep are tapped, which the events executor disturbs."""
+    executor = fastest_executor() if node.step_test else SingleThreadedExecutor()
     executor.add_node(node)
     while not ended.is_set():
         executor.spin_once(timeout_sec=POLL)

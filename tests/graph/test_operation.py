@@ -162,27 +162,39 @@ def test_the_integral_action_is_saved_while_inactive(graph: Any, save_i_term: bo
     assert list(efforts[-1].effort) == [0.5, 0.25]
 
 
-@pytest.mark.parametrize("node", ["plant", "controller", "scenario", "recorder"])
-def test_every_transition_of_the_life_cycle(graph: Any, node: str, tmp_path: Path) -> None:
+def test_every_transition_of_the_life_cycle(graph: Any, tmp_path: Path) -> None:
     """configure, activate, deactivate, cleanup and around again; shutdown ends the work also of an active node."""
-    parameters = {"bag": str(tmp_path / "bag")} if node == "recorder" else {}
-    process = graph.start(node, autostart=False, **parameters)
-    name = f"/{node}"
-    graph.wait_for_nodes(name)
+    names = ("/plant", "/controller", "/scenario", "/recorder")
+    processes = {f"/{node}": graph.start(node, autostart=False) for node in ("plant", "controller", "scenario")}
+    processes["/recorder"] = graph.start("recorder", autostart=False, bag=str(tmp_path / "bag"))
+    graph.wait_for_nodes(*names)
     asleep = {"/diagnostics", "/parameter_events", "/rosout"}
+
+    def change(transition: str) -> None:
+        for name in names:
+            assert graph.change_state(name, transition), processes[name].log
+
+    def wait_until_asleep() -> None:
+        for name in names:
+            graph.wait_until(lambda n=name: working_endpoints(graph, n[1:]) == asleep, what=f"{name} to be silent")
+
     for rounds in range(2):
         for transition in ("configure", "activate", "deactivate", "cleanup"):
-            assert graph.change_state(name, transition), process.log
-            graph.wait_for_nodes(name)
-            assert ("inactive" in graph.fact(name, "message")) == (transition != "activate")
-        graph.wait_until(lambda: working_endpoints(graph, node) == asleep, what="what `activate` created to be gone")
-        if node == "recorder":
-            assert graph.set_parameters(name, bag=str(tmp_path / f"bag{rounds}"))[0].successful
-    assert graph.change_state(name, "configure") and graph.change_state(name, "activate")
-    assert graph.change_state(name, "inactive_shutdown") is False  # it is active
-    assert graph.change_state(name, "active_shutdown")
-    assert "shut down" in graph.fresh_fact(name, "message")
-    graph.wait_until(lambda: working_endpoints(graph, node) == asleep, what="silence")
+            change(transition)
+            graph.wait_for_nodes(*names)
+            for name in names:
+                assert ("inactive" in graph.fact(name, "message")) == (transition != "activate"), name
+        wait_until_asleep()
+        assert graph.set_parameters("/recorder", bag=str(tmp_path / f"bag{rounds}"))[0].successful
+    change("configure")
+    change("activate")
+    for name in names:
+        assert graph.change_state(name, "inactive_shutdown") is False  # it is active
+    change("active_shutdown")
+    graph.wait_for_nodes(*names)
+    for name in names:
+        assert "shut down" in graph.fact(name, "message"), name
+    wait_until_asleep()
 
 
 def working_endpoints(graph: Any, node: str) -> set[str]:

@@ -54,7 +54,7 @@ def test_start_and_namespace_and_clock(graph: Any, bag: Path) -> None:
     from sensor_msgs.msg import JointState
 
     outputs, clock = graph.collect("/left/output", JointState), graph.collect("/clock", Clock)
-    replay = graph.start("replay", namespace="/left", bag=str(bag), rate=0.01, start=0.02, clock=True)
+    replay = graph.start("replay", namespace="/left", bag=str(bag), rate=0.01, start=0.02, clock=True, loop=True)
     began = time.monotonic()
     graph.wait_until(lambda: len(outputs) > 2 and clock, 60, "outputs and clock")
     assert outputs[0].header.stamp.nanosec >= 0.4e9 and time.monotonic() > began

@@ -64,14 +64,15 @@ class LiveTuner:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node("tuner", context=self._context)
+        self._pools: list[Any] = []
         self._ended = threading.Event()
         self._spinner = threading.Thread(target=self._spin, daemon=True)
         self._spinner.start()
 
     def _spin(self) -> None:
-        from rclpy.experimental import EventsExecutor
+        from rclpy.executors import SingleThreadedExecutor
 
-        executor = EventsExecutor(context=self._context)
+        executor = SingleThreadedExecutor(context=self._context)
         executor.add_node(self.node)
         while not self._ended.is_set():
             executor.spin_once(timeout_sec=0.05)
@@ -81,9 +82,13 @@ class LiveTuner:
     ) -> Any:
         from tdof_npid_ros.graph.loop_pool import LoopPool
 
-        return LoopPool(self.node, which, loops, loop_timeout, answer_timeout, lambda: None)
+        pool = LoopPool(self.node, which, loops, loop_timeout, answer_timeout, lambda: None)
+        self._pools.append(pool)
+        return pool
 
     def close(self) -> None:
+        for pool in self._pools:
+            pool.close()
         self._ended.set()
         self._spinner.join()
         self.node.destroy_node()
