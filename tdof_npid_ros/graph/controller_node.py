@@ -110,6 +110,7 @@ class ControllerNode(LoopNode):
     def _declare_options(self) -> None:
         declare = self.declare_value
         declare("setpoint", 0.0, "setpoint until one arrives on the topic")
+        declare("hold_output", False, "true: when activated, the setpoint is the first output, until another is given")
         declare("output_timeout", 0.5, "s of wall time without output until it is reported; then no jump; 0: never")
         declare("save_i_term", True, "keep the integral action while inactive")
         declare(
@@ -133,6 +134,7 @@ class ControllerNode(LoopNode):
             self.get_logger().warning(refusal)
         self.stamps.forget()
         self.controller.reset()
+        self.takes_output_as_setpoint = bool(self.values_of(["hold_output"])["hold_output"])
         self.latest_arrival_ns: int | None = None
         self.silent = False
         self.common_setpoint = np.zeros(self.controller.lanes)
@@ -175,7 +177,10 @@ class ControllerNode(LoopNode):
         if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
             self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
-            self.setpoint = r.copy()
+            self._take_setpoint(r.copy())
+
+    def _take_setpoint(self, setpoint: np.ndarray) -> None:
+        self.setpoint, self.takes_output_as_setpoint = setpoint, False
 
     def _on_manual_effort(self, message: JointState) -> None:
         effort = list(message.effort)
@@ -197,6 +202,8 @@ class ControllerNode(LoopNode):
             setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
             episode = ""  # a robot's frame
+            if self.takes_output_as_setpoint:
+                self._take_setpoint(y.copy())
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
         verdict = self.stamps.take(stamp, episode)
         if verdict == "late":
@@ -333,7 +340,7 @@ class ControllerNode(LoopNode):
         if any(name in DESCRIPTIONS for name in changes):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
-            self.setpoint = self._setpoint(changes["setpoint"])
+            self._take_setpoint(self._setpoint(changes["setpoint"]))
         if "output_timeout" in changes:
             self.output_timeout_ns = round(changes["output_timeout"] * 1e9)
 

@@ -151,8 +151,10 @@ class Graph:
         for process in self.processes:
             process.stop()
         self._executor.remove_node(self.node)
+        self._executor.shutdown()  # else the context would stay in the domain
         self.node.destroy_node()
         self._context.shutdown()
+        self._context.destroy()
         self._reservation.close()
 
     # Nodes

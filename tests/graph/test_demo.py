@@ -5,16 +5,17 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from conftest import reserved_domain
 
 from tdof_npid_ros.cli import main
 
 NODES = 3  # of the tuned loop: plant, controller, tuner
 START_TIMEOUT = 60.0  # s
 STOP_TIMEOUT = 30.0  # s
-DOMAINS = 102  # on any machine
 
 
 def children_of(pid: int) -> list[int]:
@@ -30,14 +31,15 @@ def runs(pid: int) -> bool:
 
 
 @pytest.fixture
-def demo(tmp_path: Path) -> subprocess.Popen[str]:
+def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A demo whose nodes have been started."""
+    domain, reservation = reserved_domain()
     program = subprocess.Popen(
         [sys.executable, "-m", "tdof_npid_ros", "demo", "--json", "--bag", str(tmp_path / "bag")],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % DOMAINS)},
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
     )
     end = time.monotonic() + START_TIMEOUT
@@ -45,7 +47,8 @@ def demo(tmp_path: Path) -> subprocess.Popen[str]:
         assert program.poll() is None, program.communicate()
         assert time.monotonic() < end
         time.sleep(0.05)
-    return program
+    yield program
+    reservation.close()
 
 
 def test_ctrl_c_stops_every_node(demo: subprocess.Popen[str]) -> None:

@@ -250,6 +250,33 @@ def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
     graph.publish_until(joint_states, incomplete, lambda: "has no joint wrist" in controller.log, what="a refusal")
 
 
+def test_the_first_output_is_held_until_a_setpoint_comes(graph: Any) -> None:
+    """And again after the controller was inactive."""
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    graph.start("controller", hold_output=True, kp=2.0, ki=0.0, setpoint=9.0)
+    output, message = graph.publisher("output", JointState), JointState()
+
+    def answer(y: float) -> tuple[float, float]:
+        """Setpoint and effort of the answer to an output, the next in time."""
+        message.header.stamp.sec += 1
+        message.position = [y]
+        graph.publish_until(
+            output, message, lambda: efforts and efforts[-1].header.stamp == message.header.stamp, what="an answer"
+        )
+        return efforts[-1].position[0], efforts[-1].effort[0]
+
+    assert answer(0.75) == (0.75, 0.0)
+    assert answer(0.5) == (0.75, 0.5)
+    assert graph.set_parameters("/controller", setpoint=1.0)[0].successful
+    assert answer(0.5) == (1.0, 1.0)
+    assert graph.change_state("/controller", "deactivate") and graph.change_state("/controller", "activate")
+    assert answer(0.25)[0] == answer(0.5)[0] == 0.25
+    publisher = graph.publisher("setpoint", JointState)
+    graph.publish_until(publisher, JointState(position=[1.5]), lambda: answer(0.5)[0] == 1.5, what="the setpoint")
+
+
 def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
     from rcl_interfaces.srv import ListParameters
 

@@ -76,6 +76,8 @@ class LiveTuner:
         executor.add_node(self.node)
         while not self._ended.is_set():
             executor.spin_once(timeout_sec=0.05)
+        executor.remove_node(self.node)
+        executor.shutdown()
 
     def pool(
         self, which: TuningProblem, loops: list[str], loop_timeout: float = 60.0, answer_timeout: float = 1.5
@@ -93,6 +95,7 @@ class LiveTuner:
         self._spinner.join()
         self.node.destroy_node()
         self._context.shutdown()
+        self._context.destroy()
 
 
 def use_all(pool: Any, namespaces: list[str]) -> None:
