@@ -19,10 +19,11 @@ METHOD = (
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
-    "The plant's p50 is within a few us of the bare timer's. Its p99 is made of single ticks that come 0.2 to 0.7 ms late, "
-    "at random times; they do not coincide with the node's own diagnostics (0.5 ms once a second). The bare timer has the "
-    "machine to itself, the plant shares two cores with its controller and both nodes' DDS threads. `priority` and `cpu` "
-    "(SCHED_FIFO, affinity) are there for machines that allow them; the figures are without.",
+    "The p99 of both is made of single ticks that come some 0.1 to 0.7 ms late, at random times: what else the machine does. "
+    "So it varies from run to run, and the two change places; the node's own diagnostics (0.25 ms once a second) are "
+    "too rare to show. The bare timer has the machine to itself, the plant shares two cores with its controller and both "
+    "nodes' DDS threads. `priority` and `cpu` (SCHED_FIFO, affinity) are there for machines that allow them; the figures are "
+    "without.",
 )
 
 NAMESPACE = "/bench"
