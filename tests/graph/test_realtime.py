@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from test_operation import Live
 
-SOAK_SECONDS = float(os.environ.get("TDOF_SOAK_SECONDS", "12"))
+SOAK_SECONDS = float(os.environ.get("TDOF_SOAK_SECONDS", "20"))
 WARM_UP_SECONDS = min(60.0, SOAK_SECONDS / 2)
 
 
