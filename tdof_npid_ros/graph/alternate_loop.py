@@ -101,6 +101,13 @@ class AlternateLoop:
             except (LoopLostError, TuningError) as error:
                 self._node.get_logger().error(f"the controller is left as it is: {error}")
 
+    def close(self) -> None:
+        """Leave the graph; no executor may spin the node now."""
+        self._node.destroy_subscription(self._output_subscription)
+        self._node.destroy_subscription(self._state_subscription)
+        self._node.destroy_publisher(self._setpoint_publisher)
+        self._controller.destroy()
+
     # A candidate
 
     def _begin(self) -> None:

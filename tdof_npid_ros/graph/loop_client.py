@@ -67,7 +67,7 @@ class LoopClient:
         self._taps = TapThread(self._tap.take, self._on_outputs)
 
     def destroy(self) -> None:
-        """Leave the graph."""
+        """Leave the graph; no executor may spin the node now."""
         self._taps.stop()
         self._tap.close()
         self._node.destroy_publisher(self._plan_publisher)

@@ -95,17 +95,16 @@ class LoopPool:
         return objective_values(setpoint, disturbance, self._problem.weight)
 
     def leave(self, gains: Gains | None) -> None:
-        """Set these gains, or those before the tuning, and one lane on every loop in use; then `close`."""
+        """Set these gains, or those before the tuning, and one lane on every loop in use."""
         for namespace in self.in_use:
             loop = self._loops[namespace]
             try:
                 loop.client.apply(gains or loop.before or self._problem.case.gains)
             except (LoopLostError, TuningError) as error:
                 self._node.get_logger().error(f"loop {namespace} is left as it is: {error}")
-        self.close()
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the graph; no executor may spin the node now."""
         for loop in self._loops.values():
             loop.client.destroy()
 

@@ -54,7 +54,11 @@ class Evaluator(Protocol):
         ...
 
     def leave(self, gains: Gains | None) -> None:
-        """Set these gains, or those before the tuning; nothing is evaluated after that."""
+        """Set these gains, or those before the tuning."""
+        ...
+
+    def close(self) -> None:
+        """Leave the graph; no executor may spin the node now."""
         ...
 
 
@@ -313,6 +317,8 @@ def _serve(node: TunerNode) -> int:
         stopped.wait()
     ended.set()
     spinner.join()
+    if node.activated.is_set():
+        node.evaluator.close()
     node.destroy_node()
     return status
 

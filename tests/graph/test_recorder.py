@@ -220,10 +220,10 @@ def test_a_vanished_folder_is_told_at_once_and_the_loop_goes_on(graph: Any, tmp_
 
 
 def test_a_full_disk(graph: Any, tmp_path: Path) -> None:
-    """A file system of 1 MiB; what was written before it was full stays readable."""
+    """A file system of 3 MiB, three chunks; what was written before it was full stays readable."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", disk], capture_output=True, check=False)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "none", disk], capture_output=True, check=False)
     if mounted.returncode:
         pytest.skip("mounting a small file system needs root")
     try:
@@ -231,7 +231,7 @@ def test_a_full_disk(graph: Any, tmp_path: Path) -> None:
         graph.start("controller", case=CASE)
         recorder = graph.start("recorder", bag=str(disk / "bag"), compression="none")
         graph.wait_for_nodes("/plant", "/controller", "/recorder")
-        graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "25 end"])
+        graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "60 end"])
         graph.wait_for_log(recorder, "recording stopped", 60)
         assert "No space left" in recorder.log
         recorder.stop()

@@ -89,10 +89,10 @@ class LiveTuner:
         return pool
 
     def close(self) -> None:
-        for pool in self._pools:
-            pool.close()
         self._ended.set()
         self._spinner.join()
+        for pool in self._pools:
+            pool.close()
         self.node.destroy_node()
         self._context.shutdown()
         self._context.destroy()
