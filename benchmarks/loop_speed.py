@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.harness import Rate, Result, Table, Verdict, main, plural, rate, summary
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.law import coefficients
+from tdof_npid_ros.control.law import coefficients, limits_of
 from tdof_npid_ros.loop import integrals, simulate
 from tdof_npid_ros.scenario import Signals, parse_plan
 
@@ -151,7 +151,7 @@ def _c(case: Case, steps: int, repeats: int) -> dict[str, Rate]:
         return {}
     signals = _signals(case, steps)
     plant: Any = case.plant.sampled(case.sample_period_ns)
-    c, limits = coefficients(case.gains, case.sample_period)
+    c, limits = coefficients(case.gains, case.sample_period), limits_of(case.gains)
     numbers = [
         signals.steps, C_RUNS, case.plans["setpoint"].end_ns // case.sample_period_ns, plant.delay, *np.ravel(plant.phi), *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits,
         *UNLIMITED,
@@ -194,7 +194,7 @@ def _simple_pid(case: Case, steps: int, repeats: int) -> Rate:
 
 def _answer(case: Case) -> Callable[[float, float, float], tuple[float, float, float]]:
     """The law in plain Python: y, u_i, z to u, u_i, z for a setpoint of 1."""
-    kp, ki_h, kd_h, phi, alpha, beta, q, _ = (float(value) for value in coefficients(case.gains, case.sample_period)[0][:, 0])
+    kp, ki_h, kd_h, phi, alpha, beta, q, _ = (float(value) for value in coefficients(case.gains, case.sample_period)[:, 0])
 
     def answer(y: float, u_i: float, z: float) -> tuple[float, float, float]:
         e, e_d = 1.0 - y, 1.0 - beta - y

@@ -9,16 +9,17 @@ lanes side by side so that the compiler can vectorise over them. Both give the s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
+from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of
 from tdof_npid_ros.control.operation import Operation
 from tdof_npid_ros.plants.kernels import kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
@@ -115,11 +116,11 @@ def _run(
     output: np.ndarray,
     effort: np.ndarray,
 ) -> Integrals:
-    lanes, steps = gains.lanes, signals.steps
-    c, gain_limits = coefficients(gains, signals.sample_period_ns / 1e9)
-    iae, sound = np.empty((2, lanes))
-    for first in range(0, lanes, LARGEST_BLOCK):
-        block = slice(first, min(first + LARGEST_BLOCK, lanes))
+    steps = signals.steps
+    c = coefficients(gains, signals.sample_period_ns / 1e9)
+    iae, sound = np.empty((2, gains.lanes))
+    for block in _blocks(gains):
+        gain_limits = limits_of(gains, block.start)
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
         lane_rows = _run_block_of(plant_at, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
@@ -127,6 +128,15 @@ def _run(
         if len(output):
             output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
     return Integrals(iae * (signals.sample_period_ns / 1e9), sound / (steps + 1))
+
+
+def _blocks(gains: Gains) -> Iterator[slice]:
+    """Lanes that run at once: neighbours with the same limits."""
+    low, high = (gains.per_lane(name) for name in LIMITS_PER_LANE)
+    changes = 1 + np.flatnonzero((low[1:] != low[:-1]) | (high[1:] != high[:-1]))
+    for begin, end in pairwise([0, *changes.tolist(), gains.lanes]):
+        for first in range(begin, end, LARGEST_BLOCK):
+            yield slice(first, min(first + LARGEST_BLOCK, end))
 
 
 def _width(lanes: int) -> int:

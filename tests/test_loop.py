@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
+from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, Gains
 from tdof_npid_ros.loop import integrals, simulate
 from tdof_npid_ros.paper.tables import CASES
 from tdof_npid_ros.plants.lockstep import Episode
@@ -71,6 +71,23 @@ def test_lanes_side_by_side_give_the_bits_of_each_alone(name: str, lanes: int) -
         gains = case.gains.with_values(**{n: v[j] for n, v in values.items()})
         np.testing.assert_array_equal(case.simulate("setpoint", gains).output[:, 0], together.output[:, j])
         assert case.integrals("setpoint", gains).iae[0] == summed.iae[j]
+
+
+@pytest.mark.parametrize("anti_windup", ANTI_WINDUP)
+def test_lanes_with_limits_of_their_own_give_the_bits_of_each_alone(anti_windup: str) -> None:
+    case = shortened(load_case("p1-c0.5"))
+    least, most = (-1.0, -1.0, -0.5, -math.inf, -math.inf), (1.5, 1.5, 2.0, 2.0, math.inf)
+    gains = case.gains.with_values(effort_min=least, effort_max=most, anti_windup=anti_windup)
+    together, summed = case.simulate("setpoint", gains), case.integrals("setpoint", gains)
+    outputs, efforts = stepped(case, "setpoint", gains)
+    np.testing.assert_array_equal(outputs, together.output)
+    np.testing.assert_array_equal(efforts, together.control_effort)
+    for j in range(5):
+        alone = gains.with_values(effort_min=least[j], effort_max=most[j])
+        trajectory = case.simulate("setpoint", alone)
+        np.testing.assert_array_equal(trajectory.control_effort[:, 0], together.control_effort[:, j])
+        assert case.integrals("setpoint", alone).iae[0] == summed.iae[j]
+    assert np.max(together.control_effort, axis=0)[:4].tolist() == list(most[:4])
 
 
 def test_the_integral_is_that_of_the_trajectory() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tdof_npid_ros.analysis.episodes import Episode
 from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.law import limits_of
 from tdof_npid_ros.loop import simulate
 from tdof_npid_ros.metrics import (
     DisturbanceMetrics,
@@ -91,7 +92,7 @@ def effort_use(episode: Episode, lane: int) -> EffortUse:
         return EffortUse(None, None, None)
     share = None
     if episode.gains:
-        limits = [(gains.effort_min, gains.effort_max) for gains in episode.gains]
+        limits = [limits_of(gains, min(lane, gains.lanes - 1))[:2] for gains in episode.gains]
         limits.append(_limits(episode))
         low, high = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
         share = float(np.mean((u <= low) | (u >= high)))

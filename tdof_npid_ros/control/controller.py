@@ -10,8 +10,19 @@ from functools import lru_cache
 
 import numpy as np
 
-from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.law import ALPHA, BETA, KD_H, KI_H, KP, TERMS, answer_lanes, coefficients
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
+from tdof_npid_ros.control.law import (
+    ALPHA,
+    BETA,
+    KD_H,
+    KI_H,
+    KP,
+    TERMS,
+    answer_lanes,
+    any_at_limit,
+    coefficients,
+    limits_of,
+)
 from tdof_npid_ros.control.operation import PLAIN, Operation
 from tdof_npid_ros.control.shaping import EFFORT, OUTPUT, SETPOINT, STATES, shape_lanes, shape_of
 
@@ -61,6 +72,11 @@ class Controller:
         """The integral action that the latest answer was computed with, (lanes,)."""
         return np.asarray(self.terms[TERMS.index("integral")])
 
+    @property
+    def saturated(self) -> bool:
+        """Whether the latest answer is at the effort's limits, in any lane."""
+        return bool(any_at_limit(self.effort, self._law.least, self._law.most))
+
     def change(self, gains: Gains, operation: Operation) -> None:
         """Go on with other parameters. The state is kept, unless the number of lanes changes.
 
@@ -91,6 +107,7 @@ class Controller:
         nothing = np.zeros(self.lanes)
         self.begin_within(nothing)
         self.answer(0, nothing, nothing)
+        any_at_limit(nothing, nothing, nothing)
         self.reset()
 
     def begin_within(self, applied: np.ndarray, integral: np.ndarray | None = None) -> None:
@@ -180,11 +197,12 @@ class _Law:
 
     def __init__(self, gains: Gains, operation: Operation, sample_period_ns: int) -> None:
         self.gains, self.operation = gains, operation
-        self.c, self._limits = coefficients(gains, sample_period_ns / 1e9)
-        self.shape = shape_of(operation, gains, sample_period_ns / 1e9)
+        self.c, self._limits = coefficients(gains, sample_period_ns / 1e9), limits_of(gains)
+        self.shape = shape_of(operation, sample_period_ns / 1e9)
         self._flat = self.c.ravel()
         lanes = gains.lanes
-        self._low, self._high = np.full(lanes, gains.effort_min), np.full(lanes, gains.effort_max)
+        self.least, self.most = (gains.per_lane(name).copy() for name in LIMITS_PER_LANE)
+        self._low, self._high = self.least.copy(), self.most.copy()
         self._shaped = np.empty((2, lanes))
         self._is_plain = operation.is_plain
         self._manual = np.broadcast_to(np.asarray(operation.manual_effort, dtype=np.float64), (lanes,))
@@ -202,7 +220,7 @@ class _Law:
         if self._is_plain:
             answer_lanes(self._flat, self._limits, self._low, self._high, setpoint, output, state, effort, terms)
             return
-        shape_lanes(self.shape, setpoint, output, shaping, self._shaped, self._low, self._high)
+        shape_lanes(self.shape, setpoint, output, self.least, self.most, shaping, self._shaped, self._low, self._high)
         integral = state[INTEGRAL].copy()
         r, y = self._shaped
         answer_lanes(self._flat, self._limits, self._low, self._high, r, y, state, effort, terms)
@@ -214,7 +232,17 @@ class _Law:
     def shaped(self, setpoint: np.ndarray, output: np.ndarray, shaping: np.ndarray) -> np.ndarray:
         """Setpoint and output as the law will see them, (2, lanes)."""
         shaped = np.empty_like(self._shaped)
-        shape_lanes(self.shape, setpoint, output, shaping.copy(), shaped, self._low.copy(), self._high.copy())
+        shape_lanes(
+            self.shape,
+            setpoint,
+            output,
+            self.least,
+            self.most,
+            shaping.copy(),
+            shaped,
+            self._low.copy(),
+            self._high.copy(),
+        )
         return shaped
 
     def proportional(self, r: np.ndarray, y: np.ndarray) -> np.ndarray:

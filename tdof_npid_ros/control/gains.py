@@ -21,6 +21,7 @@ TUNED: dict[ControllerType, tuple[str, ...]] = {
     "tdof_npid2": ("kp", "ki", "kd", "alpha", "beta"),
 }  # the gains that the paper tunes for each type (section 3.3)
 PER_LANE = ("kp", "ki", "kd", "alpha", "beta", "sigma")
+LIMITS_PER_LANE = ("effort_min", "effort_max")
 
 # Within these bounds no effort overflows, whatever the gains, setpoints and outputs are.
 LARGEST_GAIN = 1e50  # in SI units, of the absolute value; 1/LARGEST_GAIN is the smallest sigma
@@ -37,7 +38,7 @@ class GainsError(ValueError):
 class Gains:
     """The parameters of the control law, valid as a whole or refused.
 
-    `kp ki kd alpha beta sigma` are numbers, or tuples with one number per lane.
+    `kp ki kd alpha beta sigma effort_min effort_max` are numbers, or tuples with one number per lane.
 
     Units: u and y are the effort's and the output's; kp in u/y, ki in u/(y s), kd in u s/y, alpha and beta 1,
     sigma in y, n 1, limits in u, tracking_time in s. A reverse-acting controller has kp, ki, kd <= 0.
@@ -54,8 +55,8 @@ class Gains:
     beta: Lanes = 0.0
     sigma: Lanes = 1.0
     n: float = 10.0
-    effort_min: float = -math.inf
-    effort_max: float = math.inf
+    effort_min: Lanes = -math.inf
+    effort_max: Lanes = math.inf
     anti_windup: AntiWindup = "conditional"
     tracking_time: float = 0.0
     integral_min: float = -math.inf
@@ -64,7 +65,7 @@ class Gains:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name in PER_LANE:
+            if field.name in PER_LANE + LIMITS_PER_LANE:
                 object.__setattr__(self, field.name, lanes_of(field.name, value))
             elif field.name not in ("type", "anti_windup"):
                 object.__setattr__(self, field.name, number_of(field.name, value))
@@ -93,7 +94,7 @@ class Gains:
         for low, high in (("effort_min", "effort_max"), ("integral_min", "integral_max")):
             check_limits(self, low, high)
         lanes = self.lanes
-        for name in PER_LANE:
+        for name in PER_LANE + LIMITS_PER_LANE:
             length = len(_as_tuple(getattr(self, name)))
             if length not in (1, lanes):
                 raise GainsError(f"{name} has {length} values, but there are {lanes} lanes: give one, or one per lane")
@@ -112,7 +113,7 @@ class Gains:
     @cached_property
     def lanes(self) -> int:
         """Number of lanes that the gains are for; 1 if every gain is a single number."""
-        return max(len(_as_tuple(getattr(self, name))) for name in PER_LANE)
+        return max(len(_as_tuple(getattr(self, name))) for name in PER_LANE + LIMITS_PER_LANE)
 
     def per_lane(self, name: str, lanes: int | None = None) -> np.ndarray:
         """The gain `name` for each lane, shape (lanes,)."""
@@ -149,12 +150,15 @@ def gains_from_mapping(values: Mapping[str, Any]) -> Gains:
 
 
 def check_limits(values: Any, low: str, high: str) -> None:
-    """Raise GainsError unless there are finite numbers between the attributes `low` and `high`."""
-    lower, upper = getattr(values, low), getattr(values, high)
-    if not lower <= upper:
-        raise GainsError(f"{low} is {lower} and {high} is {upper}: need {low} <= {high}")
-    if lower == math.inf or upper == -math.inf:
-        raise GainsError(f"{low} is {lower} and {high} is {upper}: no finite number is within")
+    """Raise GainsError unless there are finite numbers between the attributes `low` and `high`, in every lane."""
+    lowers, uppers = np.atleast_1d(getattr(values, low)), np.atleast_1d(getattr(values, high))
+    if len(lowers) != len(uppers) and 1 not in (len(lowers), len(uppers)):
+        raise GainsError(f"{low} has {len(lowers)} values and {high} {len(uppers)}: give one, or one per lane")
+    for lower, upper in np.broadcast(lowers, uppers):
+        if not lower <= upper:
+            raise GainsError(f"{low} is {lower} and {high} is {upper}: need {low} <= {high}")
+        if lower == math.inf or upper == -math.inf:
+            raise GainsError(f"{low} is {lower} and {high} is {upper}: no finite number is within")
 
 
 def number_of(name: str, value: Any) -> float:

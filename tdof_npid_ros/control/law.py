@@ -12,7 +12,7 @@ import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.exponential import exp_minus
-from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
 
 # Rows of the coefficient array (COEFFICIENTS, lanes) that the compiled law reads.
 (KP, KI_H, KD_H, PHI, ALPHA, BETA, HALF_INVERSE_SIGMA2, TRACKING) = range(8)
@@ -24,7 +24,7 @@ Limits = tuple[float, float, float, float, float]  # u_min, u_max, u_i's min and
 def law(c: Any, limits: Any, r: Any, y: Any, u_i: Any, z: Any) -> Any:
     """One sample of the TDOF-NPID law. Returns u, u_i and z for the next sample, u before its limits, ζ, u_p, u_d.
 
-    Args: the coefficients of one lane and the limits (see `coefficients`), r setpoint, y output,
+    Args: the coefficients of one lane (see `coefficients`) and its limits (see `limits_of`), r setpoint, y output,
     u_i integral action, z derivative filter's state.
     """
     kp, ki_h, kd_h, phi, alpha, beta, q, tracking = c
@@ -68,7 +68,7 @@ def answer_lanes(
     """One sample of every lane.
 
     Args:
-        c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `coefficients`.
+        c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `limits_of`.
         low, high: limits of the effort at this sample, in place of those in `limits`, (lanes,).
         r, y: setpoint and output, (lanes,).
         state: integral action and derivative filter's state, (2, lanes); advanced in place.
@@ -90,6 +90,15 @@ def answer_lanes(
         terms[5, j] = raw
 
 
+@entry_point
+def any_at_limit(u: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether the effort of a lane, (lanes,), is at its limits or beyond."""
+    for j in range(u.shape[0]):  # noqa: SIM110  compiled
+        if not low[j] < u[j] < high[j]:
+            return True
+    return False
+
+
 TERMS = ("error", "scaled_error", "proportional", "integral", "derivative", "unlimited_effort")
 
 
@@ -106,15 +115,10 @@ def exp_minus_of(q: float) -> float:
     return float(_exp_minus(np.array([q]))[0])
 
 
-def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -> tuple[np.ndarray, Limits]:
-    """What the compiled law reads for gains sampled every `sample_period` seconds.
-
-    Returns:
-        The coefficients, (COEFFICIENTS, lanes), and the limits that all lanes share.
-    """
-    lanes = lanes or gains.lanes
-    h = sample_period
-    kp, ki, kd, alpha, beta, sigma = (gains.per_lane(name, lanes) for name in PER_LANE)
+def coefficients(gains: Gains, sample_period: float) -> np.ndarray:
+    """What the compiled law reads for gains sampled every `sample_period` seconds, (COEFFICIENTS, lanes)."""
+    lanes, h = gains.lanes, sample_period
+    kp, ki, kd, alpha, beta, sigma = (gains.per_lane(name) for name in PER_LANE)
     c = np.zeros((COEFFICIENTS, lanes))
     c[KP] = kp
     c[KI_H] = h * ki
@@ -131,17 +135,22 @@ def coefficients(gains: Gains, sample_period: float, lanes: int | None = None) -
         c[HALF_INVERSE_SIGMA2] = 1.0 / (2.0 * sigma * sigma)
     if gains.anti_windup == "back_calculation":
         with np.errstate(over="ignore"):
-            c[TRACKING] = 1.0 - _exp_minus(h / tracking_time(gains, lanes))
-    conditional = float(gains.anti_windup == "conditional")
-    return c, (gains.effort_min, gains.effort_max, gains.integral_min, gains.integral_max, conditional)
+            c[TRACKING] = 1.0 - _exp_minus(h / tracking_time(gains))
+    return c
 
 
-def tracking_time(gains: Gains, lanes: int | None = None) -> np.ndarray:
+def limits_of(gains: Gains, lane: int = 0) -> Limits:
+    """The limits of one lane, as the compiled law reads them."""
+    low, high = (float(gains.per_lane(name)[lane]) for name in LIMITS_PER_LANE)
+    return low, high, gains.integral_min, gains.integral_max, float(gains.anti_windup == "conditional")
+
+
+def tracking_time(gains: Gains) -> np.ndarray:
     """Back-calculation's tracking time in s, (lanes,): as given, or sqrt(kd/ki), or kp/ki without derivative action.
 
     The automatic choice is that of control_toolbox. Without integral action there is nothing to track: infinite.
     """
-    kp, ki, kd = (gains.per_lane(name, lanes) for name in ("kp", "ki", "kd"))
+    kp, ki, kd = (gains.per_lane(name) for name in ("kp", "ki", "kd"))
     if gains.tracking_time > 0:
         return np.full(kp.shape, gains.tracking_time)
     with np.errstate(divide="ignore", invalid="ignore"):

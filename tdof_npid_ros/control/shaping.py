@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
-from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import exp_minus_of
 from tdof_npid_ros.control.operation import Operation
 
@@ -27,11 +26,9 @@ class Shape(NamedTuple):
     dead_band: float
     turn: float  # 2 pi for angles, else 0
     effort_step: float
-    effort_min: float
-    effort_max: float
 
 
-def shape_of(operation: Operation, gains: Gains, sample_period: float) -> Shape:
+def shape_of(operation: Operation, sample_period: float) -> Shape:
     """The shape of an operation that is sampled every `sample_period` seconds."""
     t = operation.filter_time
     return Shape(
@@ -42,8 +39,6 @@ def shape_of(operation: Operation, gains: Gains, sample_period: float) -> Shape:
         operation.dead_band,
         2.0 * math.pi if operation.angle else 0.0,
         operation.effort_rate * sample_period,
-        gains.effort_min,
-        gains.effort_max,
     )
 
 
@@ -58,6 +53,8 @@ def shape_lanes(
     shape: Shape,
     r: np.ndarray,
     y: np.ndarray,
+    u_min: np.ndarray,
+    u_max: np.ndarray,
     state: np.ndarray,
     shaped: np.ndarray,
     low: np.ndarray,
@@ -67,11 +64,12 @@ def shape_lanes(
 
     Args:
         r, y: setpoint and output, (lanes,).
+        u_min, u_max: limits of the effort at any sample, (lanes,).
         state: (STATES, lanes); setpoint and output advance, the effort is for the caller to write.
         shaped: setpoint and output for the law, (2, lanes); written.
         low, high: limits of the effort at this sample, (lanes,); written.
     """
-    r_min, r_max, r_step, filter_gain, band, turn, u_step, u_min, u_max = shape
+    r_min, r_max, r_step, filter_gain, band, turn, u_step = shape
     for j in range(r.shape[0]):
         target = min(max(r[j], r_min), r_max)
         way = shorter_way(target - state[SETPOINT, j], turn)
@@ -93,5 +91,5 @@ def shape_lanes(
         shaped[0, j] = target
         shaped[1, j] = measured
 
-        low[j] = min(max(u_min, state[EFFORT, j] - u_step), u_max)
-        high[j] = max(min(u_max, state[EFFORT, j] + u_step), u_min)
+        low[j] = min(max(u_min[j], state[EFFORT, j] - u_step), u_max[j])
+        high[j] = max(min(u_max[j], state[EFFORT, j] + u_step), u_min[j])

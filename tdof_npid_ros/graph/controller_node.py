@@ -56,8 +56,8 @@ DESCRIPTIONS = {
     "beta": "setpoint weight on the derivative action (6); tdof_npid2",
     "sigma": "width of the nonlinear gain (4), in the output's unit, above 0; all but pid",
     "n": "derivative filter N (1b), above 0; usually 5 to 30",
-    "effort_min": "lower limit of the effort",
-    "effort_max": "upper limit of the effort",
+    "effort_min": "lower limit of the effort; an array gives one value per lane",
+    "effort_max": "upper limit of the effort; an array gives one value per lane",
     "anti_windup": f"what the integral action does at a limit: {', '.join(ANTI_WINDUP)}",
     "tracking_time": "s; of back_calculation; 0: sqrt(kd/ki), or kp/ki without derivative action",
     "integral_min": "lower limit of the integral action, in the effort's unit",
@@ -276,7 +276,7 @@ class ControllerNode(LoopNode):
             self.counts["repeated"] += 1
             return
         self.counts["steps"] += 1
-        if not controller.gains.effort_min < controller.effort[0] < controller.gains.effort_max:
+        if controller.saturated:
             self.counts["saturated"] += 1
         if self.state_publisher.get_subscription_count():
             self._publish_terms()

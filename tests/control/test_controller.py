@@ -102,6 +102,26 @@ def test_manual_effort_keeps_the_limits() -> None:
     assert loop.run(8)[:6] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.5])
 
 
+@pytest.mark.parametrize("operation", [PLAIN, Operation(effort_rate=1e6), Operation(manual=True, manual_effort=9.0)])
+def test_every_lane_keeps_limits_of_its_own(operation: Operation) -> None:
+    gains = Gains("pid", kp=5.0, effort_min=-1.0, effort_max=(0.5, 2.0, 7.0))
+    controller = Controller(gains, PERIOD_NS, operation)
+    controller.answer(0, np.ones(3), np.zeros(3))
+    assert controller.effort.tolist() == [0.5, 2.0, 7.0 if operation.manual else 5.0]
+    assert controller.saturated
+    controller.answer(PERIOD_NS, np.ones(3), np.full(3, 3.0))
+    assert controller.effort.tolist() == ([0.5, 2.0, 7.0] if operation.manual else [-1.0] * 3)
+    if not operation.manual:
+        controller.answer(2 * PERIOD_NS, np.ones(3), np.ones(3))
+        assert not controller.saturated
+
+
+@pytest.mark.parametrize("most", [(1.0, -2.0), (1.0, -math.inf), (1.0, 2.0, 3.0)])
+def test_wrong_limits_of_lanes_are_refused(most: tuple[float, ...]) -> None:
+    with pytest.raises(GainsError, match="effort_m"):
+        Gains(kp=(1.0, 2.0), effort_min=(-1.0, -1.0), effort_max=most)
+
+
 def test_setpoint_ramp_starts_from_the_output_and_keeps_its_rate() -> None:
     ramped = Loop(Gains("pid", kp=1.0), Operation(setpoint_rate=2.0))
     ramped.y = 0.5

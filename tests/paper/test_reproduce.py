@@ -193,7 +193,7 @@ def test_the_inferred_simulation_is_a_filter_advanced_before_it_is_used() -> Non
     row = row_of("p1-c0.5", "tdof_npid2")
     _, case, gains = inferred(row)
     h, filter_time = case.sample_period, row.kd / row.kp / published_gains(row).n
-    c, _ = coefficients(gains, h)
+    c = coefficients(gains, h)
     phi = math.exp(-h / filter_time)
     assert c[PHI, 0] == pytest.approx(phi)
     assert c[KD_H, 0] == pytest.approx(row.kd / filter_time * phi)  # u_d = K_d/T_f (e - z⁺), e - z⁺ = φ (e - z)
