@@ -67,11 +67,13 @@ def test_distributed_equals_local(graph: Any, case: str) -> None:
 
 
 def test_distributed_equals_local_with_lanes(graph: Any) -> None:
-    gains = load_case("p1-c0.5").gains.with_values(kp=(9.4, 5.0, 2.0), alpha=(0.3, 0.2, 0.0))
-    y, u = run_short(graph, "p1-c0.5", lanes=3, kp=gains.kp, alpha=gains.alpha)
+    values = {"kp": (9.4, 5.0, 2.0), "alpha": (0.3, 0.2, 0.0), "effort_max": (4.0, 3.0, math.inf)}
+    gains = load_case("p1-c0.5").gains.with_values(**values)
+    y, u = run_short(graph, "p1-c0.5", lanes=3, **values)
     local = load_short("p1-c0.5").simulate("short", gains)
     assert np.array_equal(y, local.output)
     assert np.array_equal(u, local.control_effort)
+    assert u.max(axis=0)[:2].tolist() == [4.0, 3.0]
 
 
 def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> None:
