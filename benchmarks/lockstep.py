@@ -21,7 +21,8 @@ NOTES = (
     "What bounds it: most of a round trip is DDS and the waking of the other process, the same in both. Of a step's 144 us "
     "(median, one lane) the ping-pong takes 123; each node computes 7 us before it publishes, and colder caches "
     "do the rest. Answers are published before all bookkeeping. Tried without a measurable "
-    "gain: shared memory alone, UDP alone, no piggybacked heartbeats, `spin_until_future_complete` in place of `spin_once`. "
+    "gain: shared memory (the nodes use UDP, for its safe restarts; the ping-pong has both), no piggybacked heartbeats, "
+    "`spin_until_future_complete` in place of `spin_once`. "
     "A second message on its way would hide the latency, but a loop has only one.",
 )
 

@@ -59,7 +59,8 @@ class RealtimePlant:
     def _on_tick(self) -> None:
         node, now = self._node, STEADY.now().nanoseconds
         if self.first_tick_ns is None:
-            self.first_tick_ns, self.latest_tick_ns, self.due_ticks = now, now, 0
+            self.first_tick_ns = self.latest_tick_ns = now
+            self.ticks = self.missed_ticks = 0
         else:
             self._account_for_tick(now)
             was_silent = self.failsafe.silent
@@ -77,10 +78,11 @@ class RealtimePlant:
         assert self.first_tick_ns is not None
         self.period_error.add(abs(now - self.latest_tick_ns - self.wall_period_ns))
         self.latest_tick_ns = now
-        due = (now - self.first_tick_ns + self.wall_period_ns // 2) // self.wall_period_ns
-        if due > self.due_ticks + 1:
-            self._node.counts["missed_ticks"] += due - self.due_ticks - 1
-        self.due_ticks = max(due, self.due_ticks)
+        self.ticks += 1
+        missed = (now - self.first_tick_ns) // self.wall_period_ns - self.ticks
+        if missed > self.missed_ticks:
+            self._node.counts["missed_ticks"] += missed - self.missed_ticks
+            self.missed_ticks = missed
 
     def _on_effort(self, message: JointState) -> None:
         if not self._node.is_sound(message.effort, "control_effort"):
