@@ -6,17 +6,24 @@ The node is imported in here, so that Ctrl-C ends it at once and quietly, also w
 from __future__ import annotations
 
 import importlib
+import os
+import signal
 import sys
+from types import FrameType
 
 NODES = ("plant", "controller", "scenario", "tuner", "recorder", "replay")
 
 
 def run(node: str, arguments: list[str]) -> None:
     """Run a node with its command line's arguments, the program's name first."""
-    try:
-        importlib.import_module(f"tdof_npid_ros.graph.{node}_node").main(arguments)
-    except KeyboardInterrupt:
-        sys.exit(0)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _leave)
+    importlib.import_module(f"tdof_npid_ros.graph.{node}_node").main(arguments)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End at once: there is nothing to put in order before the node is there and takes the signals itself."""
+    os._exit(0)
 
 
 def plant() -> None:

@@ -95,6 +95,17 @@ def test_nodes_start_in_any_order_in_a_namespace_and_end_at_once(graph: Any) -> 
         assert process.stop() < AT_ONCE
 
 
+def test_ctrl_c_again_and_again_while_it_is_loaded(graph: Any) -> None:
+    process = graph.start("plant")
+    maps = Path(f"/proc/{process.process.pid}/maps")
+    graph.wait_until(lambda: "librcl" in maps.read_text(), what="the first library")
+    process.stopped = True
+    while process.process.poll() is None:
+        process.send(signal.SIGINT)
+        graph.spin_once(0.01)
+    assert (process.process.returncode, process.log) == (0, "")
+
+
 def test_controller_killed_and_restarted(graph: Any) -> None:
     plant = graph.start("plant", mode="lockstep", reply_timeout=0.05, retries=2)
     controller = graph.start("controller")
