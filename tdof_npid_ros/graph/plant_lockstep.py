@@ -151,8 +151,11 @@ class LockstepPlant:
 
     def on_matched(self, status: Any) -> None:
         """A subscriber of `output` has come: if it is the controller, it can go on."""
-        if self.stopped and self.episode is not None and status.current_count_change > 0:
-            self.running, self.stopped, self.repeats = True, False, 0
+        if self.episode is None or status.current_count_change <= 0:
+            return
+        self.repeats = 0  # what was published before, it may not have heard
+        if self.stopped:
+            self.running, self.stopped = True, False
             self._repeat_output(self.episode)
 
     def _publish_clock(self) -> None:
