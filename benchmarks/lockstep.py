@@ -12,8 +12,8 @@ from benchmarks.recorder import run_loop
 TITLE = "Lockstep over DDS"
 METHOD = (
     "Steps per second of one episode of Process 1 with plant and controller as two processes, after a "
-    "short one (the ping-pong, too, is timed once the two have met), by the plant's reports; recorded: with the recorder as a third, writing every topic. Beside it two bare rclpy processes "
-    "that send the same message, as long as the loop's, to and fro, one at a time: the limit of any such loop. They "
+    "short one (the ping-pong, too, is timed once the two have met), by the plant's reports; recorded: with the recorder "
+    "as a third, writing every topic. Beside it two bare rclpy processes that send the same message, as long as the loop's, to and fro, one at a time: the limit of any such loop. They "
     "run with rclpy's default executor and with its events executor, and the faster counts. In turn, round by round."
 )
 PEERS = ("ros-jazzy-rclpy",)

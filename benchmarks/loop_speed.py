@@ -118,7 +118,7 @@ def _signals(case: Case, steps: int) -> Signals:
 
 
 def _lanes_of(gains: Gains, lanes: int) -> Gains:
-    kp = gains.per_lane("kp", 1)[0]
+    kp = gains.per_lane("kp")[0]
     return gains.with_values(kp=tuple(kp * np.linspace(0.9, 1.0, lanes))) if lanes > 1 else gains
 
 

@@ -22,6 +22,7 @@ TUNED: dict[ControllerType, tuple[str, ...]] = {
 }  # the gains that the paper tunes for each type (section 3.3)
 PER_LANE = ("kp", "ki", "kd", "alpha", "beta", "sigma")
 LIMITS_PER_LANE = ("effort_min", "effort_max")
+ALL_PER_LANE = PER_LANE + LIMITS_PER_LANE
 
 # Within these bounds no effort overflows, whatever the gains, setpoints and outputs are.
 LARGEST_GAIN = 1e50  # in SI units, of the absolute value; 1/LARGEST_GAIN is the smallest sigma
@@ -65,7 +66,7 @@ class Gains:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name in PER_LANE + LIMITS_PER_LANE:
+            if field.name in ALL_PER_LANE:
                 object.__setattr__(self, field.name, lanes_of(field.name, value))
             elif field.name not in ("type", "anti_windup"):
                 object.__setattr__(self, field.name, number_of(field.name, value))
@@ -91,10 +92,10 @@ class Gains:
             raise GainsError(
                 f"tracking_time is {self.tracking_time} s: it must be finite and not below 0 (0: automatic)"
             )
-        for low, high in (("effort_min", "effort_max"), ("integral_min", "integral_max")):
+        for low, high in (LIMITS_PER_LANE, ("integral_min", "integral_max")):
             check_limits(self, low, high)
         lanes = self.lanes
-        for name in PER_LANE + LIMITS_PER_LANE:
+        for name in ALL_PER_LANE:
             length = len(_as_tuple(getattr(self, name)))
             if length not in (1, lanes):
                 raise GainsError(f"{name} has {length} values, but there are {lanes} lanes: give one, or one per lane")
@@ -113,11 +114,11 @@ class Gains:
     @cached_property
     def lanes(self) -> int:
         """Number of lanes that the gains are for; 1 if every gain is a single number."""
-        return max(len(_as_tuple(getattr(self, name))) for name in PER_LANE + LIMITS_PER_LANE)
+        return max(len(_as_tuple(getattr(self, name))) for name in ALL_PER_LANE)
 
-    def per_lane(self, name: str, lanes: int | None = None) -> np.ndarray:
+    def per_lane(self, name: str) -> np.ndarray:
         """The gain `name` for each lane, shape (lanes,)."""
-        return np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (lanes or self.lanes,))
+        return np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (self.lanes,))
 
     def with_values(self, **changes: Any) -> Gains:
         """New gains with some values changed, validated as a whole."""

@@ -417,8 +417,7 @@ def spin(node: LoopNode, stop: Stop | None = None) -> None:
 
 
 def _spin_until_leftovers(node: LoopNode, stop: Stop | None) -> None:
-    executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
-    executor.add_node(node)
+    executor = executor_for(node)
     if stop is not None:
         stop.wakes(executor)
     while rclpy.ok() and not (stop and stop.requested) and not node.leftovers:
@@ -445,6 +444,13 @@ def _destroy_leftovers(node: LoopNode) -> None:
     node.leftovers = []
     executor.remove_node(node)
     executor.shutdown()
+
+
+def executor_for(node: LoopNode) -> Any:
+    """An executor that serves this node: the fastest, unless the node needs one that knows callback groups."""
+    executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
+    executor.add_node(node)
+    return executor
 
 
 def fastest_executor() -> Any:

@@ -60,7 +60,7 @@ class RealtimePlant:
         node, now = self._node, STEADY.now().nanoseconds
         if self.first_tick_ns is None:
             self.first_tick_ns = self.latest_tick_ns = now
-            self.ticks = self.missed_ticks = 0
+            self.missed_ticks = 0
         else:
             self._account_for_tick(now)
             was_silent = self.failsafe.silent
@@ -78,8 +78,7 @@ class RealtimePlant:
         assert self.first_tick_ns is not None
         self.period_error.add(abs(now - self.latest_tick_ns - self.wall_period_ns))
         self.latest_tick_ns = now
-        self.ticks += 1
-        missed = (now - self.first_tick_ns) // self.wall_period_ns - self.ticks
+        missed = (now - self.first_tick_ns) // self.wall_period_ns - (self.step + 1)
         if missed > self.missed_ticks:
             self._node.counts["missed_ticks"] += missed - self.missed_ticks
             self.missed_ticks = missed

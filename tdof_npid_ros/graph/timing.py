@@ -26,9 +26,11 @@ class LatestTimes:
 
     def facts(self, name: str) -> dict[str, object]:
         """Percentiles in microseconds, for the diagnostics."""
+        if not self._count:
+            return {}
         times = np.sort(self._times[: self._count])  # np.percentile takes ten times as long when it is not in the caches
-        shares = PERCENTILES.items() if self._count else ()
-        return {f"{name}_{key}_us": f"{times[round(share * (len(times) - 1))] / 1e3:.1f}" for key, share in shares}
+        last = len(times) - 1
+        return {f"{name}_{key}_us": f"{times[round(share * last)] / 1e3:.1f}" for key, share in PERCENTILES.items()}
 
 
 def prepare_for_realtime(priority: int, cpu: int) -> list[str]:

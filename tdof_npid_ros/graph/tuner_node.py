@@ -12,7 +12,6 @@ from types import FrameType
 from typing import Protocol
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
@@ -23,7 +22,7 @@ from tdof_npid_ros.graph.alternate_loop import AlternateLoop
 from tdof_npid_ros.graph.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.graph.messages import signal_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, fastest_executor, number
+from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, executor_for, number
 from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -80,6 +79,7 @@ class TunerNode(LoopNode):
         resume = self.declare_value("resume", True, "go on from the checkpoint if it is there", fixed=True)
         self.result_file = self._declare_path("result", "ROS parameter file to write the optimum to")
         self.step_test = self._declare_step_test()
+        self.uses_events_executor = self.step_test is not None  # else outputs are tapped, and taps must be left alone
         self.stay = self.declare_value("stay", False, "stay on the graph when done, instead of ending", fixed=True)
         if self.result_file is not None:
             check_writable(self.result_file)
@@ -324,9 +324,7 @@ def _serve(node: TunerNode) -> int:
 
 
 def _spin(node: TunerNode, ended: threading.Event) -> None:
-    """Serve the node's services and timers; outputs of loops in lockstep are tapped, which the events executor disturbs."""
-    executor = fastest_executor() if node.step_test else SingleThreadedExecutor()
-    executor.add_node(node)
+    executor = executor_for(node)
     while not ended.is_set():
         executor.spin_once(timeout_sec=POLL)
     executor.remove_node(node)
