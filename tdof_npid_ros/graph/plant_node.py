@@ -16,6 +16,7 @@ from tdof_npid_ros.graph.messages import all_within, as_field, lane_names, set_s
 from tdof_npid_ros.graph.node import LoopNode, number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
+from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
@@ -93,15 +94,17 @@ class PlantNode(LoopNode):
             "realtime: take control_effort only from publishers that promise this deadline and lease",
             fixed=True,
         )
-        declare("priority", 0, "realtime: priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
-        declare("cpu", -1, "realtime: number of the processor to stay on; -1: any", fixed=True)
+        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
+        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
 
     def activate(self) -> None:
         """Create topics, services and timers."""
         self.output.header.frame_id = ""
-        promised = self.values_of(["deadline", "lease"])
-        deadline = promised["deadline"] if self.mode == "realtime" else 0.0
-        qos = signal_qos(1000, deadline, promised["lease"])
+        p = self.values_of(["deadline", "lease", "priority", "cpu"])
+        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
+            self.get_logger().warning(refusal)
+        deadline = p["deadline"] if self.mode == "realtime" else 0.0
+        qos = signal_qos(1000, deadline, p["lease"])
         self.output_publisher = self.publisher_of(JointState, "output", qos, matched=self.way_of_running.on_matched)
         self.create_service(Trigger, "plant/reset", self._on_reset)
         self.way_of_running.activate()

@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.messages import stamp_ns, values
 from tdof_npid_ros.graph.node import ERROR, OK, RECENT, STEADY, WARN
-from tdof_npid_ros.graph.timing import LatestTimes, prepare_for_realtime
+from tdof_npid_ros.graph.timing import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
 
 if TYPE_CHECKING:
@@ -26,9 +26,7 @@ class RealtimePlant:
     def activate(self) -> None:
         """Create the topics and the timer."""
         node = self._node
-        p = node.values_of(["speed", "deadline", "lease", "request_deadline", "priority", "cpu"])
-        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
-            node.get_logger().warning(refusal)
+        p = node.values_of(["speed", "deadline", "lease", "request_deadline"])
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
         self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
         self.reset()
