@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.signals import SignalReader
 
 Key = tuple[str, int]  # episode and stamp in ns
 
@@ -50,10 +50,8 @@ class Recorded:
 
     def key(self, output: bytes) -> Key | None:
         """Episode and stamp of a serialized output, if the recorded controller answered it."""
-        order = "<" if output[1] else ">"
-        seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", output, 4)
-        frame = output[16 : 16 + max(length - 1, 0)].decode()
-        key = frame if "/" in frame else "", seconds * 1_000_000_000 + nanoseconds  # a robot's frame is no episode
+        signal = SignalReader().read(output)
+        key = signal.frame_id if "/" in signal.frame_id else "", signal.stamp_ns  # a robot's frame is no episode
         return key if key in self.answers else None
 
 

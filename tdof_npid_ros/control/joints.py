@@ -31,5 +31,5 @@ class Joints:
             missing = [name for name in self.names if name not in names]
             if missing:
                 raise ValueError(f"has no joint {', '.join(missing)}: it has {', '.join(names)}")
-            self._indices, self._of = [list(names).index(name) for name in self.names], list(names)
+            self._indices, self._of = [names.index(name) for name in self.names], names
         return field[self._indices] if len(field) == len(names) else field[:0]

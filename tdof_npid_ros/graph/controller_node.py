@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -23,14 +22,8 @@ from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_map
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.messages import (
-    NO_VALUES,
-    all_within,
-    as_field,
     lane_names,
     plan_from_message,
-    signal_message,
-    stamp_ns,
-    values,
 )
 from tdof_npid_ros.graph.node import (
     ERROR,
@@ -46,6 +39,7 @@ from tdof_npid_ros.graph.node import (
 )
 from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.signals import NO_VALUES, Signal, SignalWriter
 
 DESCRIPTIONS = {
     "type": f"control law: {', '.join(CONTROLLER_TYPES)}",
@@ -91,7 +85,6 @@ class ControllerNode(LoopNode):
             gains_from_mapping(given), sample_period_in_ns(period), operation_from_mapping(given)
         )
         self.controller.warm_up()
-        all_within(np.zeros(1), LARGEST_SIGNAL)  # compiles, too
         self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
         if self.joints.names and len(self.joints.names) != self.controller.lanes:
             raise ValueError(
@@ -104,7 +97,7 @@ class ControllerNode(LoopNode):
         self.saved_integral: np.ndarray | None = None
         self.plan: Plan | None = None
         self.stamps = Stamps()
-        self.waiting: JointState | None = None
+        self.waiting: Signal | None = None
         self.accept_changes()
 
     def _declare_options(self) -> None:
@@ -138,17 +131,19 @@ class ControllerNode(LoopNode):
         self.latest_arrival_ns: int | None = None
         self.silent = False
         self.common_setpoint = np.zeros(self.controller.lanes)
-        self.effort = signal_message("")
+        self.effort = SignalWriter()
         self.effort_for = ("", "")
-        self.terms = signal_message("")
+        self.answer = b""
+        self.terms = SignalWriter()
+        self.terms_for = 0
         effort_qos = signal_qos(1000, p["deadline"], p["lease"])
         recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
         self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        self.subscribe(JointState, "setpoint", self._on_setpoint, signal_qos(10))
-        self.subscribe(JointState, "manual_effort", self._on_manual_effort, signal_qos(1))
-        self.subscribe(JointState, "output", self._on_output, recent, sole=True)
+        self.subscribe_signal("setpoint", self._on_setpoint, signal_qos(10))
+        self.subscribe_signal("manual_effort", self._on_manual_effort, signal_qos(1))
+        self.subscribe_signal("output", self._on_output, recent, sole=True)
         self.create_timer(SILENCE_LOOKS, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:
@@ -170,52 +165,51 @@ class ControllerNode(LoopNode):
         if self.waiting is not None:
             self._on_output(self.waiting)
 
-    def _on_setpoint(self, message: JointState) -> None:
-        r = self._picked("setpoint", message.name, message.position)
+    def _on_setpoint(self, signal: Signal) -> None:
+        r = self._picked("setpoint", signal.name, signal.position)
         if r is None:
             return
         if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
             self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
-            self._take_setpoint(r.copy())
+            self._take_setpoint(r)
 
     def _take_setpoint(self, setpoint: np.ndarray) -> None:
         self.setpoint, self.takes_output_as_setpoint = setpoint, False
 
-    def _on_manual_effort(self, message: JointState) -> None:
-        effort = list(message.effort)
+    def _on_manual_effort(self, signal: Signal) -> None:
+        effort = signal.effort.tolist()
         parameter = Parameter("manual_effort", value=effort if len(effort) > 1 else effort[0] if effort else math.nan)
         if not self.set_parameters([parameter])[0].successful:
             self.counts["rejected"] += 1
 
-    def _on_output(self, message: JointState) -> None:
-        header = message.header
-        stamp, episode = stamp_ns(header.stamp), header.frame_id
-        y = self._picked("output", message.name, message.position)
-        if y is None or not self._is_sound(y):
+    def _on_output(self, output: Signal) -> None:
+        stamp, episode = output.stamp_ns, output.frame_id
+        y = self._picked("output", output.name, output.position)
+        if y is None or not self.is_sound("output", y, self.controller.lanes, LARGEST_SIGNAL):
             return
         if "/" in episode:
             if self.plan is None or not episode.startswith(self.plan.digest):
-                self.waiting = message  # its plan is on the way
+                self.waiting = output  # its plan is on the way
                 return
             self.waiting = None
             setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
             episode = ""  # a robot's frame
             if self.takes_output_as_setpoint:
-                self._take_setpoint(y.copy())
+                self._take_setpoint(y)
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
         verdict = self.stamps.take(stamp, episode)
         if verdict == "late":
             self.counts["late"] += 1
             return
-        begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, message)
+        begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, output)
         is_new = self.controller.answer(stamp, setpoint, y)
         if is_new:
-            self._fill_answer(header.stamp, episode, setpoint, begins_within)
-        self.effort_publisher.publish(self.effort)
+            self.answer = self._answer(stamp, episode, setpoint, begins_within)
+        self.effort_publisher.publish(self.answer)
         # The plant waits for the answer, so all else comes after it.
-        self._note_answer(is_new)
+        self._note_answer(stamp, is_new)
 
     def _on_every_lane(self, setpoint: float) -> np.ndarray:
         """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
@@ -223,7 +217,7 @@ class ControllerNode(LoopNode):
             self.common_setpoint = np.full(self.controller.lanes, setpoint)
         return self.common_setpoint
 
-    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, message: JointState) -> bool:
+    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, output: Signal) -> bool:
         """Reset the controller at a loop's start, or let it begin within a running loop; True for the latter."""
         now = time.monotonic_ns()
         latest, self.latest_arrival_ns = self.latest_arrival_ns, now
@@ -237,40 +231,38 @@ class ControllerNode(LoopNode):
         if restarts and begins_from_nothing(stamp, episode):
             self.controller.reset()
             return False
-        applied = self._applied(message)
+        applied = self._applied(output)
         if applied is None:
             return False
         self.controller.begin_within(applied, saved if saved is not None and len(saved) == len(applied) else None)
         return True
 
-    def _applied(self, message: JointState) -> np.ndarray | None:
+    def _applied(self, output: Signal) -> np.ndarray | None:
         """The effort that the plant reports, or else our own latest; None if the controller is to begin from nothing."""
-        applied = self._picked("output", message.name, message.effort)
+        applied = self._picked("output", output.name, output.effort)
         if applied is not None and len(applied) == self.controller.lanes and np.isfinite(applied).all():
-            return applied.copy()
+            return applied
         if self.counts["steps"]:
             return self.controller.effort.copy()
         self.controller.reset()
         return None
 
-    def _fill_answer(self, stamp: Time, episode: str, setpoint: np.ndarray, begins_within: bool) -> None:
-        effort, header, digest = self.effort, self.effort.header, self.controller.digest
+    def _answer(self, stamp: int, episode: str, setpoint: np.ndarray, begins_within: bool) -> bytes:
+        controller, digest = self.controller, self.controller.digest
         if self.effort_for != (digest, episode):
             self.effort_for = (digest, episode)
-            effort.name = self.joints.names or lane_names(self.controller.lanes)
-            header.frame_id = f"{digest} {episode}" if episode else digest
-        header.stamp = stamp
-        effort.effort = as_field(self.controller.effort)
-        effort.position = as_field(setpoint)
+            names = self.joints.names or lane_names(controller.lanes)
+            self.effort.label(f"{digest} {episode}" if episode else digest, names)
         # The first answer within a running loop bears the integral action that it began with, for `verify`.
-        effort.velocity = as_field(self.controller.integral_before) if begins_within else NO_VALUES
+        began_with = controller.integral_before if begins_within else NO_VALUES
+        return self.effort.write(stamp, position=setpoint, velocity=began_with, effort=controller.effort)
 
     def _on_effort_matched(self, status: Any) -> None:
         """A reader of `control_effort` has come. A plant in lockstep may be waiting for what it could not hear yet."""
         if status.current_count_change > 0 and "/" in self.effort_for[1]:
-            self.effort_publisher.publish(self.effort)
+            self.effort_publisher.publish(self.answer)
 
-    def _note_answer(self, is_new: bool) -> None:
+    def _note_answer(self, stamp: int, is_new: bool) -> None:
         controller = self.controller
         if not is_new:
             self.counts["repeated"] += 1
@@ -279,27 +271,15 @@ class ControllerNode(LoopNode):
         if controller.saturated:
             self.counts["saturated"] += 1
         if self.state_publisher.get_subscription_count():
-            self._publish_terms()
+            self._publish_terms(stamp)
 
-    def _picked(self, topic: str, names: Sequence[str], field: Any) -> np.ndarray | None:
-        """A field's values for the lanes; None if it is refused."""
-        if not self.joints.names:
-            return values(field)
+    def _picked(self, topic: str, names: Sequence[str], values: np.ndarray) -> np.ndarray | None:
+        """A signal's values for the lanes; None if it is refused."""
         try:
-            return self.joints.picked(names, values(field))
+            return self.joints.picked(names, values)
         except ValueError as error:
             self.refuse("rejected", f"{topic} refused", f": it {error}")
             return None
-
-    def _is_sound(self, y: np.ndarray) -> bool:
-        lanes = self.controller.lanes
-        if len(y) != lanes:
-            self.refuse("rejected", "output refused", f": it has {len(y)} values, the gains are for {lanes} lanes")
-        elif not all_within(y, LARGEST_SIGNAL):
-            self.refuse("rejected", "output that is not finite refused")
-        else:
-            return True
-        return False
 
     def _look_for_silence(self) -> None:
         if self.silent or not self.output_timeout_ns or self.latest_arrival_ns is None or "/" in self.effort_for[1]:
@@ -313,13 +293,13 @@ class ControllerNode(LoopNode):
 
     # What goes out
 
-    def _publish_terms(self) -> None:
+    def _publish_terms(self, stamp: int) -> None:
         lanes = self.controller.lanes
-        if len(self.terms.name) != len(TERMS) * lanes:
-            self.terms.name = [term if lanes == 1 else f"{term}/{lane}" for term in TERMS for lane in range(lanes)]
-        self.terms.header.stamp = self.effort.header.stamp
-        self.terms.position = as_field(self.controller.terms)
-        self.state_publisher.publish(self.terms)
+        if self.terms_for != lanes:
+            self.terms_for = lanes
+            names = [term if lanes == 1 else f"{term}/{lane}" for term in TERMS for lane in range(lanes)]
+            self.terms.label("", names)
+        self.state_publisher.publish(self.terms.write(stamp, position=self.controller.terms))
 
     # Parameters and state
 

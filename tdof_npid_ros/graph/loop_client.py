@@ -9,20 +9,19 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_candidates, gains_from_mapping
-from tdof_npid_ros.graph.messages import plan_message, stamp_ns, values
+from tdof_npid_ros.graph.messages import plan_message
 from tdof_npid_ros.graph.node import LATCHED_QOS
 from tdof_npid_ros.graph.remote_node import RemoteNode
 from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.signals import SignalReader
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -64,6 +63,7 @@ class LoopClient:
         self._ended = threading.Condition()
         self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
         self._tap = Tap(node, f"{base}/output", "sensor_msgs/msg/JointState", OUTPUT_QOS)
+        self._reader = SignalReader()
         self._taps = TapThread(self._tap.take, self._on_outputs)
 
     def destroy(self) -> None:
@@ -162,8 +162,11 @@ class LoopClient:
         if outputs is None:
             return
         for taken in found:
-            message = deserialize_message(taken.data, JointState)
-            outputs.take(message.header.frame_id, stamp_ns(message.header.stamp), values(message.position))
+            try:
+                output = self._reader.read(taken.data)
+            except ValueError:
+                continue  # nothing that a plant has published
+            outputs.take(output.frame_id, output.stamp_ns, output.position)
         if outputs.complete or outputs.cut:
             with self._ended:
                 self._ended.notify()

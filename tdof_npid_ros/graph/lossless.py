@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sensor_msgs.msg import JointState
-
-from tdof_npid_ros.graph.messages import stamp_ns
 from tdof_npid_ros.graph.node import SIGNAL_QOS, LoopNode
+from tdof_npid_ros.signals import Signal
 
 TOPIC = "recorded"
 WINDOW = 600  # steps; publishers keep 1000 messages
@@ -30,7 +28,7 @@ class Log:
         self._window_ns = WINDOW * period_ns
         self._grown = grown
         self._episode, self._stamp_ns = "", 0
-        node.create_subscription(JointState, TOPIC, self._on_recorded, SIGNAL_QOS)
+        node.subscribe_signal(TOPIC, self._on_recorded, SIGNAL_QOS)
 
     def holds(self, episode: str, time_ns: int) -> bool:
         """Whether the output of that time and its answer are in the log."""
@@ -40,6 +38,6 @@ class Log:
         """Whether the output of `time_ns` of an episode that has begun may be published."""
         return self._episode == NO_LOG or time_ns - self._stamp_ns < self._window_ns
 
-    def _on_recorded(self, message: JointState) -> None:
-        self._episode, self._stamp_ns = message.header.frame_id, stamp_ns(message.header.stamp)
+    def _on_recorded(self, signal: Signal) -> None:
+        self._episode, self._stamp_ns = signal.frame_id, signal.stamp_ns
         self._grown()

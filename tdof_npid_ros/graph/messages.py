@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,9 +13,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tdof_npid_ros.compiled import entry_point
 from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.signals import SECOND
 
-SECOND = 1_000_000_000  # ns
-NO_VALUES = array("d")
 NAMED_LANES = 8  # more are read by programs, which go by the place
 
 
@@ -36,23 +34,13 @@ def time_message(time_ns: int) -> Time:
     return Time(sec=sec, nanosec=nanosec)
 
 
-def values(field: array[float]) -> np.ndarray:
-    """A message's float64 field as an array that shares its memory."""
-    return np.frombuffer(field, dtype=np.float64)
-
-
 @entry_point
-def all_within(values_: np.ndarray, largest: float) -> bool:
+def all_within(values: np.ndarray, largest: float) -> bool:
     """Whether every value's magnitude is at most `largest`; that of nan is not."""
-    for value in values_:  # noqa: SIM110  compiled
+    for value in values:  # noqa: SIM110  compiled
         if not abs(value) <= largest:
             return False
     return True
-
-
-def as_field(values_: np.ndarray) -> array[float]:
-    """A copy of a float64 array for a message's field."""
-    return array("d", values_.tobytes())
 
 
 def plan_message(plan: Plan, start_ns: int) -> JointTrajectory:

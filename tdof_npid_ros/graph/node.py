@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -21,11 +22,13 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
-from tdof_npid_ros.graph.messages import diagnostics_message
+from tdof_npid_ros.graph.messages import all_within, diagnostics_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
+from tdof_npid_ros.signals import Signal, SignalReader
 
 SIGNAL_QOS = signal_qos(1000)
 RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
@@ -99,11 +102,44 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def subscribe(
-        self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile, sole: bool = False
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        sole: bool = False,
+        raw: bool = False,
     ) -> None:
         """A subscription that reports profiles that do not fit and, if one publisher is expected, a second one."""
         events = self.endpoints.subscription_events(topic, sole)
-        self.create_subscription(message_type, topic, callback, qos, event_callbacks=events)
+        self.create_subscription(message_type, topic, callback, qos, event_callbacks=events, raw=raw)
+
+    def subscribe_signal(
+        self, topic: str, callback: Callable[[Signal], None], qos: QoSProfile, sole: bool = False
+    ) -> None:
+        """As `subscribe`, to a signal."""
+        reader = SignalReader()
+
+        def on_data(data: bytes) -> None:
+            try:
+                signal = reader.read(data)
+            except ValueError as error:
+                self.refuse("rejected", f"{topic} refused", f": {error}")
+            else:
+                callback(signal)
+
+        self.subscribe(JointState, topic, on_data, qos, sole, raw=True)
+        all_within(np.zeros(1), 1.0)  # compiles, too
+
+    def is_sound(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
+        """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""
+        if len(values) != lanes:
+            self.refuse("rejected", f"{topic} refused", f": it has {len(values)} values for {lanes} lanes")
+        elif not all_within(values, largest):
+            self.refuse("rejected", f"{topic} that is not finite refused")
+        else:
+            return True
+        return False
 
     # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due before.
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.graph.lossless import Log
-from tdof_npid_ros.graph.messages import plan_from_message, set_stamp, stamp_ns, values
+from tdof_npid_ros.graph.messages import plan_from_message, set_stamp
 from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.signals import Signal
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
@@ -36,7 +36,7 @@ class LockstepPlant:
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        node.subscribe(JointState, "control_effort", self._on_answer, RECENT_QOS, sole=True)
+        node.subscribe_signal("control_effort", self._on_answer, RECENT_QOS, sole=True)
         self.held = False  # an output waits for the log
         self.log = Log(node, node.period_ns, self._on_log_grown) if node.lossless else None
         timeout = float(node.values_of(["reply_timeout"])["reply_timeout"])
@@ -66,30 +66,30 @@ class LockstepPlant:
         self.episodes += 1
         node.make_simulator()
         self.episode = Episode(plan, node.simulator, node.plant_at, self.episodes)
-        node.output.header.frame_id = self.episode.name
+        node.label_output(self.episode.name)
         self.running, self.stopped, self.repeats = True, False, 0
         node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {self.episode.steps} steps")
         self.held = False
         node.publish_output(0)
         node.publish_diagnostics()
 
-    def _on_answer(self, message: JointState) -> None:
-        node, episode, header = self._node, self.episode, message.header
+    def _on_answer(self, answer: Signal) -> None:
+        node, episode = self._node, self.episode
         if (
             episode is None
             or not (self.running or self.stopped)
-            or not episode.awaits(stamp_ns(header.stamp), header.frame_id)
+            or not episode.awaits(answer.stamp_ns, answer.frame_id)
         ):
             node.counts["late"] += 1
             return
-        if not node.is_sound(message.effort, "control_effort"):
+        if not node.takes("control_effort", answer.effort):
             return
         if not self._is_logged(episode):
             return  # it comes again
         if self.stopped:
             node.get_logger().info("the controller answers again: going on")
             self.running, self.stopped = True, False
-        if episode.answer(values(message.effort)):
+        if episode.answer(answer.effort):
             self._publish_when_logged(episode)
         else:
             self.running = False

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import all_within, as_field, lane_names, set_stamp, signal_message, values
+from tdof_npid_ros.graph.messages import lane_names
 from tdof_npid_ros.graph.node import LoopNode, number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
@@ -20,6 +20,7 @@ from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.signals import SignalWriter
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 FALLBACKS = ("effort", "hold")
@@ -54,10 +55,9 @@ class PlantNode(LoopNode):
         self.joints = [str(name) for name in names if name]
         self.checked({})
         self.accept_changes()
-        self.output = signal_message("")
+        self.output = SignalWriter()
         self.make_simulator()
         self.simulator.warm_up()
-        all_within(np.zeros(1), sys.float_info.max)  # compiles, too
         self.way_of_running = MODES[self.mode](self)
 
     def _declare_model(self) -> None:
@@ -99,7 +99,6 @@ class PlantNode(LoopNode):
 
     def activate(self) -> None:
         """Create topics, services and timers."""
-        self.output.header.frame_id = ""
         p = self.values_of(["deadline", "lease", "priority", "cpu"])
         for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
             self.get_logger().warning(refusal)
@@ -111,21 +110,14 @@ class PlantNode(LoopNode):
 
     def publish_output(self, time_ns: int) -> None:
         """Publish what the plant puts out now, stamped with the loop's time."""
-        set_stamp(self.output.header.stamp, time_ns)
-        self.output.position = as_field(self.simulator.output)
-        self.output.effort = as_field(self.simulator.applied_effort)
-        self.output_publisher.publish(self.output)
+        simulator = self.simulator
+        self.output_publisher.publish(
+            self.output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
+        )
 
-    def is_sound(self, field: Any, topic: str) -> bool:
-        """Whether a message's field has one finite value per lane; else it is refused."""
-        lanes = self.simulator.lanes
-        if len(field) != lanes:
-            self.refuse("rejected", f"{topic} refused", f": it has {len(field)} values for {lanes} lanes")
-        elif not all_within(values(field), sys.float_info.max):
-            self.refuse("rejected", f"{topic} that is not finite refused")
-        else:
-            return True
-        return False
+    def takes(self, topic: str, effort: np.ndarray) -> bool:
+        """Whether there is one finite value per lane; else it is refused."""
+        return self.is_sound(topic, effort, self.simulator.lanes, sys.float_info.max)
 
     def plant_at(self, changes: dict[str, float]) -> Plant:
         """The plant with some parameters changed."""
@@ -135,7 +127,10 @@ class PlantNode(LoopNode):
         """Begin again, at the initial state, with the parameters as they are now."""
         lanes = int(self.values_of(["lanes"])["lanes"])
         self.simulator = PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
-        self.output.name = self.joints or lane_names(lanes)
+
+    def label_output(self, episode: str) -> None:
+        """What the outputs bear in `header.frame_id` from now on, beside the names of the lanes."""
+        self.output.label(episode, self.joints or lane_names(self.simulator.lanes))
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
@@ -161,7 +156,9 @@ class PlantNode(LoopNode):
         if isinstance(p["lanes"], bool) or not isinstance(p["lanes"], int) or not 1 <= p["lanes"] <= 100_000:
             raise ValueError(f"lanes is {p['lanes']!r}: it must be a whole number from 1 to 100000")
         if self.joints and len(self.joints) != p["lanes"]:
-            raise ValueError(f"joint_names has {len(self.joints)} names, but lanes is {p['lanes']}: give one name per lane")
+            raise ValueError(
+                f"joint_names has {len(self.joints)} names, but lanes is {p['lanes']}: give one name per lane"
+            )
         if not number("effort_min", p["effort_min"]) <= number("effort_max", p["effort_max"]):
             raise ValueError(
                 f"effort_min is {p['effort_min']} and effort_max {p['effort_max']}: need effort_min <= effort_max"

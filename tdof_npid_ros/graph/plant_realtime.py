@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import stamp_ns, values
 from tdof_npid_ros.graph.node import ERROR, OK, RECENT, STEADY, WARN
 from tdof_npid_ros.graph.timing import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
+from tdof_npid_ros.signals import Signal
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
@@ -31,13 +30,14 @@ class RealtimePlant:
         self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
         self.reset()
         recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
-        node.subscribe(JointState, "control_effort", self._on_effort, recent, sole=True)
-        node.subscribe(JointState, "disturbance", self._on_disturbance, signal_qos(1))
+        node.subscribe_signal("control_effort", self._on_effort, recent, sole=True)
+        node.subscribe_signal("disturbance", self._on_disturbance, signal_qos(1))
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
 
     def reset(self) -> tuple[bool, str]:
         """Back to the initial state, at time 0."""
         self._node.make_simulator()
+        self._node.label_output("")
         self._start()
         return True, "at the initial state, time 0"
 
@@ -81,14 +81,14 @@ class RealtimePlant:
             self._node.counts["missed_ticks"] += missed - self.missed_ticks
             self.missed_ticks = missed
 
-    def _on_effort(self, message: JointState) -> None:
-        if not self._node.is_sound(message.effort, "control_effort"):
+    def _on_effort(self, signal: Signal) -> None:
+        if not self._node.takes("control_effort", signal.effort):
             return
         now = STEADY.now().nanoseconds
         stamp, published = self.output_ns
-        if stamp_ns(message.header.stamp) == stamp:
+        if signal.stamp_ns == stamp:
             self.output_to_effort.add(now - published)
-        if self.failsafe.take(values(message.effort).copy(), now):
+        if self.failsafe.take(signal.effort, now):
             self._node.get_logger().info("control_effort comes again: going over to it")
 
     def _report_silence(self) -> None:
@@ -97,11 +97,11 @@ class RealtimePlant:
         self._node.counts["silences"] += 1
         self._node.get_logger().error(f"no control_effort for {p['effort_timeout']:g} s: {does}")
 
-    def _on_disturbance(self, message: JointState) -> None:
-        if len(message.effort) == 1 and self._node.simulator.lanes > 1:
-            message.effort = message.effort * self._node.simulator.lanes
-        if self._node.is_sound(message.effort, "disturbance"):
-            self.disturbance = values(message.effort).copy()
+    def _on_disturbance(self, signal: Signal) -> None:
+        lanes = self._node.simulator.lanes
+        disturbance = np.repeat(signal.effort, lanes) if len(signal.effort) == 1 else signal.effort
+        if self._node.takes("disturbance", disturbance):
+            self.disturbance = disturbance
 
     def on_matched(self, status: Any) -> None:
         """Nothing waits for subscribers."""

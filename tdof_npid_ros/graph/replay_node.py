@@ -14,16 +14,15 @@ from typing import Any
 
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.analysis.compare import Comparison, Recorded
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
-from tdof_npid_ros.graph.messages import set_stamp, stamp_ns, values
+from tdof_npid_ros.graph.messages import set_stamp
 from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
 from tdof_npid_ros.graph.tap import message_class
+from tdof_npid_ros.signals import SECOND, Signal
 
-SECOND = 1_000_000_000  # ns
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
 FOR_CONTROLLER = ("scenario_plan", "setpoint")  # what a controller is given, besides the output
@@ -73,7 +72,7 @@ class ReplayNode(LoopNode):
         self.publishers_of = {topic: publisher for topic in self._topics() if (publisher := self._publisher(topic))}
         self.clock_publisher = self.create_publisher(Clock, CLOCK, 10) if self.clock else None
         if self.compare:
-            self.create_subscription(JointState, "control_effort", self._on_answer, SIGNAL_QOS)
+            self.subscribe_signal("control_effort", self._on_answer, SIGNAL_QOS)
         self.thread = threading.Thread(target=self._play, name="replay", daemon=True)
         self.thread.start()
 
@@ -180,13 +179,13 @@ class ReplayNode(LoopNode):
             f"no answer to the output at {expected[1] / SECOND:g} s: start a controller in this namespace"
         )
 
-    def _on_answer(self, message: JointState) -> None:
+    def _on_answer(self, answer: Signal) -> None:
         assert self.recorded is not None
-        digest, _, episode = message.header.frame_id.partition(" ")
-        key = episode, stamp_ns(message.header.stamp)
+        digest, _, episode = answer.frame_id.partition(" ")
+        key = episode, answer.stamp_ns
         with self.answered:
             if key != self.answer:
-                self.comparison.take(self.recorded, key, digest, values(message.effort))
+                self.comparison.take(self.recorded, key, digest, answer.effort)
                 self.answer = key
                 self.answered.notify()
 

@@ -7,7 +7,6 @@ then takes whatever has come in the meantime.
 from __future__ import annotations
 
 import importlib
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +17,8 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+
+from tdof_npid_ros.signals import SignalReader
 
 SHORTEST_PAUSE = 0.005  # s between two looks while messages come
 LONGEST_PAUSE = 0.1  # s between two looks while nothing comes; DDS keeps 5000 messages for each subscription
@@ -131,6 +132,7 @@ class LogProgress:
 
     def __init__(self, topics: Sequence[str]) -> None:
         self._latest: dict[str, tuple[str, int]] = {topic: ("", -1) for topic in topics}
+        self._readers = {topic: SignalReader() for topic in topics}
         self.episode, self.stamp_ns = "", -1
 
     def take(self, messages: Iterable[Taken]) -> bool:
@@ -139,20 +141,19 @@ class LogProgress:
         if not newest:
             return False
         for topic, data in newest.items():
-            self._latest[topic] = _episode_and_stamp(data)
+            try:
+                signal = self._readers[topic].read(data)
+            except ValueError:
+                continue  # nothing that a plant or controller has published
+            self._latest[topic] = (
+                signal.frame_id.rpartition(" ")[2],
+                signal.stamp_ns,
+            )  # an answer's begins with a digest
         before = self.episode, self.stamp_ns
         episodes = {episode for episode, _ in self._latest.values()}
         if len(episodes) == 1:
             self.episode, self.stamp_ns = episodes.pop(), min(stamp for _, stamp in self._latest.values())
         return before != (self.episode, self.stamp_ns)
-
-
-def _episode_and_stamp(data: bytes) -> tuple[str, int]:
-    """What a serialized header says: the episode, after the digest of the parameters in an answer, and the stamp."""
-    order = "<" if data[1] else ">"
-    seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
-    text = data[16 : 16 + length - 1].decode(errors="replace")
-    return text.rpartition(" ")[2], seconds * 1_000_000_000 + nanoseconds
 
 
 class TapThread:

@@ -160,6 +160,9 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
         )
         return JointState(header=header, name=["x" * rng.randint(0, 99)], position=values, effort=values)
 
+    def junk() -> bytes:
+        return b"\0\1\0\0" + rng.randbytes(rng.randint(0, 99))
+
     def plan() -> Any:
         points = [
             JointTrajectoryPoint(positions=[rng.choice(bad)] * rng.randint(0, 3)) for _ in range(rng.randint(0, 4))
@@ -172,6 +175,7 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
         f"/live/{name}": (JointState, signal_) for name in ("output", "setpoint", "control_effort", "disturbance")
     }
     makers["/live/manual_effort"] = (JointState, signal_)
+    not_read_here = ("/live/setpoint", "/live/disturbance", "/live/manual_effort")  # the others end this test's node
     makers["/live/scenario_plan"] = (JointTrajectory, plan)
     for topic, (kind, make) in makers.items():
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -182,6 +186,8 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
         )
         for _ in range(MALFORMED):
             publisher.publish(make())
+            if topic in not_read_here:
+                publisher.publish(junk())
             live.graph.spin_once(0.0)
         live.graph.node.destroy_publisher(publisher)
     live.settle()

@@ -256,6 +256,7 @@ class TestController:
         loop.time_ns = stamp_ns
         assert self.answer_again(loop, 0.1).effort == latest.effort  # no state has advanced
         assert loop.process.log.count("output that is not finite refused") == 1
+        assert "output refused: it has 0 values for 1 lanes" in loop.process.log
 
     def test_bad_setpoints_are_refused(self, loop: Any) -> None:
         from sensor_msgs.msg import JointState
