@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 SECOND: Final = 1_000_000_000  # ns
 _STAMP: Final = 4  # where header.stamp is; places are aligned as counted from here
 _LABELS: Final = 12  # where header.frame_id is, and name after it
@@ -36,14 +37,14 @@ _OWN_HEAD: Final = b"\0\1" if sys.byteorder == "little" else b"\0\0"
 _OWN: Final = _ORDERS[_OWN_HEAD]
 
 
-class Signal(NamedTuple):
-    """One message.
+class Sample(NamedTuple):
+    """One message of a signal.
 
     Attributes:
         stamp_ns: header.stamp.
         frame_id: header.frame_id.
         name: (names,).
-        position, velocity, effort: each (lanes,), or empty; the signal's own memory.
+        position, velocity, effort: each (lanes,), or empty; the sample's own memory.
     """
 
     stamp_ns: int
@@ -64,8 +65,8 @@ class SignalReader:
         self._frame_id = ""
         self._name: tuple[str, ...] = ()
 
-    def read(self, data: bytes) -> Signal:
-        """The signal in a serialized message.
+    def read(self, data: bytes) -> Sample:
+        """The sample in a serialized message.
 
         Raises:
             ValueError: it is not a JointState in plain CDR.
@@ -79,7 +80,7 @@ class SignalReader:
             effort, at = self._values(data, at)
         except (struct.error, ValueError, KeyError):
             raise ValueError(f"its {len(data)} bytes are not a JointState in plain CDR") from None
-        return Signal(seconds * SECOND + nanoseconds, self._frame_id, self._name, position, velocity, effort)
+        return Sample(seconds * SECOND + nanoseconds, self._frame_id, self._name, position, velocity, effort)
 
     def _values(self, data: bytes, at: int) -> tuple[np.ndarray, int]:
         (count,) = self._order.length.unpack_from(data, at)

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tdof_npid_ros.signals import NO_VALUES, Signal, SignalReader, SignalWriter
+from tdof_npid_ros.signals import NO_VALUES, Sample, SignalReader, SignalWriter
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"
 words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)
 values = st.lists(st.floats(width=64), max_size=5).map(np.array).map(np.float64)
-signals = st.builds(
-    Signal,
+samples = st.builds(
+    Sample,
     stamp_ns=st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9),
     frame_id=words,
     name=st.lists(words, max_size=4).map(tuple),
@@ -27,46 +27,46 @@ signals = st.builds(
 )
 
 
-def serialized(signal: Signal, little_endian: bool = True) -> bytes:
+def serialized(sample: Sample, little_endian: bool = True) -> bytes:
     of: Any = TYPES.types
-    seconds, nanoseconds = divmod(signal.stamp_ns, 10**9)
-    header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](seconds, nanoseconds), signal.frame_id)
-    message = of[JOINT_STATE](header, list(signal.name), signal.position, signal.velocity, signal.effort)
+    seconds, nanoseconds = divmod(sample.stamp_ns, 10**9)
+    header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](seconds, nanoseconds), sample.frame_id)
+    message = of[JOINT_STATE](header, list(sample.name), sample.position, sample.velocity, sample.effort)
     return bytes(TYPES.serialize_cdr(message, JOINT_STATE, little_endian=little_endian))
 
 
-def is_same(a: Signal, b: Signal) -> bool:
+def is_same(a: Sample, b: Sample) -> bool:
     return a[:3] == b[:3] and all(one.tobytes() == other.tobytes() for one, other in zip(a[3:], b[3:], strict=True))
 
 
-@given(st.lists(st.tuples(signals, st.booleans()), min_size=1, max_size=4))
-def test_one_reader_reads_whatever_comes(several: list[tuple[Signal, bool]]) -> None:
+@given(st.lists(st.tuples(samples, st.booleans()), min_size=1, max_size=4))
+def test_one_reader_reads_whatever_comes(several: list[tuple[Sample, bool]]) -> None:
     reader = SignalReader()
-    for signal, little_endian in several * 2:
-        assert is_same(reader.read(serialized(signal, little_endian)), signal)
+    for sample, little_endian in several * 2:
+        assert is_same(reader.read(serialized(sample, little_endian)), sample)
 
 
-@given(signals, st.integers(0, 10**12))
-def test_what_is_written_is_what_others_write(signal: Signal, later_ns: int) -> None:
+@given(samples, st.integers(0, 10**12))
+def test_what_is_written_is_what_others_write(sample: Sample, later_ns: int) -> None:
     writer = SignalWriter()
-    writer.label(signal.frame_id, signal.name)
-    for stamp_ns in (later_ns, signal.stamp_ns):
-        data = writer.write(stamp_ns, signal.position, signal.velocity, signal.effort)
-        expected = serialized(signal._replace(stamp_ns=stamp_ns))
+    writer.label(sample.frame_id, sample.name)
+    for stamp_ns in (later_ns, sample.stamp_ns):
+        data = writer.write(stamp_ns, sample.position, sample.velocity, sample.effort)
+        expected = serialized(sample._replace(stamp_ns=stamp_ns))
         assert data == expected[: len(data)]
         assert not any(expected[len(data) :])
 
 
-@given(signals, st.data())
-def test_a_message_cut_short_is_refused_and_the_next_one_read(signal: Signal, data: st.DataObject) -> None:
+@given(samples, st.data())
+def test_a_message_cut_short_is_refused_and_the_next_one_read(sample: Sample, data: st.DataObject) -> None:
     writer, reader = SignalWriter(), SignalReader()
-    writer.label(signal.frame_id, signal.name)
-    whole = writer.write(signal.stamp_ns, signal.position, signal.velocity, signal.effort)
+    writer.label(sample.frame_id, sample.name)
+    whole = writer.write(sample.stamp_ns, sample.position, sample.velocity, sample.effort)
     cut = data.draw(st.integers(0, len(whole) - 1))
     for _ in range(2):
         with pytest.raises(ValueError, match=f"its {cut} bytes are not a JointState"):
             reader.read(whole[:cut])
-        assert is_same(reader.read(whole), signal)
+        assert is_same(reader.read(whole), sample)
 
 
 @given(st.binary(max_size=200))
@@ -74,11 +74,11 @@ def test_any_bytes_are_a_signal_or_refused(data: bytes) -> None:
     reader = SignalReader()
     for head in (b"", b"\0\1\0\0", b"\0\0\0\0"):
         try:
-            signal = reader.read(head + data)
+            sample = reader.read(head + data)
         except ValueError as error:
             assert "not a JointState" in str(error)
         else:
-            assert len(signal.position) <= len(data) / 8
+            assert len(sample.position) <= len(data) / 8
 
 
 def test_other_encodings_are_refused() -> None:
@@ -89,7 +89,7 @@ def test_other_encodings_are_refused() -> None:
 
 def test_values_are_the_signals_own() -> None:
     reader, writer = SignalReader(), SignalWriter()
-    signal = reader.read(writer.write(0, effort=np.array([1.0, 2.0])))
-    assert signal.position is NO_VALUES
-    signal.effort[0] = 3.0  # a node may keep and change it
-    assert signal.effort.flags.aligned
+    sample = reader.read(writer.write(0, effort=np.array([1.0, 2.0])))
+    assert sample.position is NO_VALUES
+    sample.effort[0] = 3.0  # a node may keep and change it
+    assert sample.effort.flags.aligned

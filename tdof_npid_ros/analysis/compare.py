@@ -50,8 +50,11 @@ class Recorded:
 
     def key(self, output: bytes) -> Key | None:
         """Episode and stamp of a serialized output, if the recorded controller answered it."""
-        signal = SignalReader().read(output)
-        key = signal.frame_id if "/" in signal.frame_id else "", signal.stamp_ns  # a robot's frame is no episode
+        try:
+            sample = SignalReader().read(output)
+        except ValueError:
+            return None  # nobody could read it
+        key = sample.frame_id if "/" in sample.frame_id else "", sample.stamp_ns  # a robot's frame is no episode
         return key if key in self.answers else None
 
 

@@ -13,12 +13,11 @@ from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
 from tdof_npid_ros.bag.columns import SEQUENCE
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.scenario import Plan, PlanError
+from tdof_npid_ros.signals import JOINT_STATE, SECOND
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 _OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
 _FIELDS = ("header.stamp", "header.frame_id", "name", "position", "velocity", "effort")
-_SECOND = 1_000_000_000  # ns
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def _plans(reader: BagReader, topic: str) -> dict[str, Plan]:
         try:
             plan = Plan(
                 tuple(message["joint_names"]),
-                tuple(time["sec"] * _SECOND + time["nanosec"] for time in times),
+                tuple(time["sec"] * SECOND + time["nanosec"] for time in times),
                 tuple(tuple(point["positions"].tolist()) for point in message["points"]),
             )
         except PlanError:

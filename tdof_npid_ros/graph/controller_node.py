@@ -39,7 +39,7 @@ from tdof_npid_ros.graph.node import (
 )
 from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import NO_VALUES, Signal, SignalWriter
+from tdof_npid_ros.signals import NO_VALUES, Sample, SignalWriter
 
 DESCRIPTIONS = {
     "type": f"control law: {', '.join(CONTROLLER_TYPES)}",
@@ -97,7 +97,7 @@ class ControllerNode(LoopNode):
         self.saved_integral: np.ndarray | None = None
         self.plan: Plan | None = None
         self.stamps = Stamps()
-        self.waiting: Signal | None = None
+        self.waiting: Sample | None = None
         self.accept_changes()
 
     def _declare_options(self) -> None:
@@ -165,8 +165,8 @@ class ControllerNode(LoopNode):
         if self.waiting is not None:
             self._on_output(self.waiting)
 
-    def _on_setpoint(self, signal: Signal) -> None:
-        r = self._picked("setpoint", signal.name, signal.position)
+    def _on_setpoint(self, sample: Sample) -> None:
+        r = self._picked("setpoint", sample.name, sample.position)
         if r is None:
             return
         if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
@@ -177,13 +177,13 @@ class ControllerNode(LoopNode):
     def _take_setpoint(self, setpoint: np.ndarray) -> None:
         self.setpoint, self.takes_output_as_setpoint = setpoint, False
 
-    def _on_manual_effort(self, signal: Signal) -> None:
-        effort = signal.effort.tolist()
+    def _on_manual_effort(self, sample: Sample) -> None:
+        effort = sample.effort.tolist()
         parameter = Parameter("manual_effort", value=effort if len(effort) > 1 else effort[0] if effort else math.nan)
         if not self.set_parameters([parameter])[0].successful:
             self.counts["rejected"] += 1
 
-    def _on_output(self, output: Signal) -> None:
+    def _on_output(self, output: Sample) -> None:
         stamp, episode = output.stamp_ns, output.frame_id
         y = self._picked("output", output.name, output.position)
         if y is None or not self.is_sound("output", y, self.controller.lanes, LARGEST_SIGNAL):
@@ -217,7 +217,7 @@ class ControllerNode(LoopNode):
             self.common_setpoint = np.full(self.controller.lanes, setpoint)
         return self.common_setpoint
 
-    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, output: Signal) -> bool:
+    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, output: Sample) -> bool:
         """Reset the controller at a loop's start, or let it begin within a running loop; True for the latter."""
         now = time.monotonic_ns()
         latest, self.latest_arrival_ns = self.latest_arrival_ns, now
@@ -237,7 +237,7 @@ class ControllerNode(LoopNode):
         self.controller.begin_within(applied, saved if saved is not None and len(saved) == len(applied) else None)
         return True
 
-    def _applied(self, output: Signal) -> np.ndarray | None:
+    def _applied(self, output: Sample) -> np.ndarray | None:
         """The effort that the plant reports, or else our own latest; None if the controller is to begin from nothing."""
         applied = self._picked("output", output.name, output.effort)
         if applied is not None and len(applied) == self.controller.lanes and np.isfinite(applied).all():

@@ -21,7 +21,7 @@ from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import SignalReader
+from tdof_npid_ros.signals import JOINT_STATE, SignalReader
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -62,7 +62,7 @@ class LoopClient:
         self._outputs: EpisodeOutputs | None = None
         self._ended = threading.Condition()
         self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
-        self._tap = Tap(node, f"{base}/output", "sensor_msgs/msg/JointState", OUTPUT_QOS)
+        self._tap = Tap(node, f"{base}/output", JOINT_STATE, OUTPUT_QOS)
         self._reader = SignalReader()
         self._taps = TapThread(self._tap.take, self._on_outputs)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tdof_npid_ros.graph.node import SIGNAL_QOS, LoopNode
-from tdof_npid_ros.signals import Signal
+from tdof_npid_ros.signals import Sample
 
 TOPIC = "recorded"
 WINDOW = 600  # steps; publishers keep 1000 messages
@@ -38,6 +38,6 @@ class Log:
         """Whether the output of `time_ns` of an episode that has begun may be published."""
         return self._episode == NO_LOG or time_ns - self._stamp_ns < self._window_ns
 
-    def _on_recorded(self, signal: Signal) -> None:
-        self._episode, self._stamp_ns = signal.frame_id, signal.stamp_ns
+    def _on_recorded(self, sample: Sample) -> None:
+        self._episode, self._stamp_ns = sample.frame_id, sample.stamp_ns
         self._grown()

@@ -28,7 +28,7 @@ from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import all_within, diagnostics_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
-from tdof_npid_ros.signals import Signal, SignalReader
+from tdof_npid_ros.signals import Sample, SignalReader
 
 SIGNAL_QOS = signal_qos(1000)
 RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
@@ -115,18 +115,18 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.create_subscription(message_type, topic, callback, qos, event_callbacks=events, raw=raw)
 
     def subscribe_signal(
-        self, topic: str, callback: Callable[[Signal], None], qos: QoSProfile, sole: bool = False
+        self, topic: str, callback: Callable[[Sample], None], qos: QoSProfile, sole: bool = False
     ) -> None:
         """As `subscribe`, to a signal."""
         reader = SignalReader()
 
         def on_data(data: bytes) -> None:
             try:
-                signal = reader.read(data)
+                sample = reader.read(data)
             except ValueError as error:
                 self.refuse("rejected", f"{topic} refused", f": {error}")
             else:
-                callback(signal)
+                callback(sample)
 
         self.subscribe(JointState, topic, on_data, qos, sole, raw=True)
         all_within(np.zeros(1), 1.0)  # compiles, too

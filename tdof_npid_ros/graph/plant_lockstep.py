@@ -12,7 +12,7 @@ from tdof_npid_ros.graph.messages import plan_from_message, set_stamp
 from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import Signal
+from tdof_npid_ros.signals import Sample
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
@@ -73,7 +73,7 @@ class LockstepPlant:
         node.publish_output(0)
         node.publish_diagnostics()
 
-    def _on_answer(self, answer: Signal) -> None:
+    def _on_answer(self, answer: Sample) -> None:
         node, episode = self._node, self.episode
         if (
             episode is None

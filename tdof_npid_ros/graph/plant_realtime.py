@@ -10,7 +10,7 @@ from tdof_npid_ros.graph.endpoints import signal_qos
 from tdof_npid_ros.graph.node import ERROR, OK, RECENT, STEADY, WARN
 from tdof_npid_ros.graph.timing import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
-from tdof_npid_ros.signals import Signal
+from tdof_npid_ros.signals import Sample
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
@@ -81,14 +81,14 @@ class RealtimePlant:
             self._node.counts["missed_ticks"] += missed - self.missed_ticks
             self.missed_ticks = missed
 
-    def _on_effort(self, signal: Signal) -> None:
-        if not self._node.takes("control_effort", signal.effort):
+    def _on_effort(self, sample: Sample) -> None:
+        if not self._node.takes("control_effort", sample.effort):
             return
         now = STEADY.now().nanoseconds
         stamp, published = self.output_ns
-        if signal.stamp_ns == stamp:
+        if sample.stamp_ns == stamp:
             self.output_to_effort.add(now - published)
-        if self.failsafe.take(signal.effort, now):
+        if self.failsafe.take(sample.effort, now):
             self._node.get_logger().info("control_effort comes again: going over to it")
 
     def _report_silence(self) -> None:
@@ -97,9 +97,9 @@ class RealtimePlant:
         self._node.counts["silences"] += 1
         self._node.get_logger().error(f"no control_effort for {p['effort_timeout']:g} s: {does}")
 
-    def _on_disturbance(self, signal: Signal) -> None:
+    def _on_disturbance(self, sample: Sample) -> None:
         lanes = self._node.simulator.lanes
-        disturbance = np.repeat(signal.effort, lanes) if len(signal.effort) == 1 else signal.effort
+        disturbance = np.repeat(sample.effort, lanes) if len(sample.effort) == 1 else sample.effort
         if self._node.takes("disturbance", disturbance):
             self.disturbance = disturbance
 

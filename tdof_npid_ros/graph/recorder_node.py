@@ -32,6 +32,7 @@ from tdof_npid_ros.graph.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread, message_class
+from tdof_npid_ros.signals import JOINT_STATE
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
 CALM_DISCOVERY_PERIOD = 0.5  # s, when it does not
@@ -40,11 +41,11 @@ PARAMETER_EVENTS = "/parameter_events"
 EVERYTHING = ["*", PARAMETER_EVENTS, "/rosout", "/diagnostics", "/clock"]
 # The loop's own topics are subscribed before their publishers come, so that not even the first message is missed.
 EXPECTED = {
-    "output": "sensor_msgs/msg/JointState",
-    "control_effort": "sensor_msgs/msg/JointState",
-    "setpoint": "sensor_msgs/msg/JointState",
-    "disturbance": "sensor_msgs/msg/JointState",
-    "controller_state": "sensor_msgs/msg/JointState",
+    "output": JOINT_STATE,
+    "control_effort": JOINT_STATE,
+    "setpoint": JOINT_STATE,
+    "disturbance": JOINT_STATE,
+    "controller_state": JOINT_STATE,
     "scenario_plan": "trajectory_msgs/msg/JointTrajectory",
     "/clock": "rosgraph_msgs/msg/Clock",
 }

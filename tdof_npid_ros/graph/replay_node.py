@@ -21,7 +21,7 @@ from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.graph.messages import set_stamp
 from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
 from tdof_npid_ros.graph.tap import message_class
-from tdof_npid_ros.signals import SECOND, Signal
+from tdof_npid_ros.signals import SECOND, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
@@ -179,7 +179,7 @@ class ReplayNode(LoopNode):
             f"no answer to the output at {expected[1] / SECOND:g} s: start a controller in this namespace"
         )
 
-    def _on_answer(self, answer: Signal) -> None:
+    def _on_answer(self, answer: Sample) -> None:
         assert self.recorded is not None
         digest, _, episode = answer.frame_id.partition(" ")
         key = episode, answer.stamp_ns

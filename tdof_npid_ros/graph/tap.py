@@ -142,13 +142,11 @@ class LogProgress:
             return False
         for topic, data in newest.items():
             try:
-                signal = self._readers[topic].read(data)
+                sample = self._readers[topic].read(data)
             except ValueError:
                 continue  # nothing that a plant or controller has published
-            self._latest[topic] = (
-                signal.frame_id.rpartition(" ")[2],
-                signal.stamp_ns,
-            )  # an answer's begins with a digest
+            episode = sample.frame_id.rpartition(" ")[2]  # an answer's begins with a digest
+            self._latest[topic] = episode, sample.stamp_ns
         before = self.episode, self.stamp_ns
         episodes = {episode for episode, _ in self._latest.values()}
         if len(episodes) == 1:
