@@ -129,11 +129,11 @@ class SignalWriter:
         velocity: np.ndarray = NO_VALUES,
         effort: np.ndarray = NO_VALUES,
     ) -> bytes:
-        """The serialized message with these values, each (lanes,) of float64, or empty."""
+        """The serialized message with these values: float64 of any shape, written in C order, or empty."""
         parts = [_OWN_HEAD, b"\0\0", _OWN.stamp.pack(*divmod(stamp_ns, SECOND)), self._labels]
         at = _LABELS + len(self._labels)
         for values in (position, velocity, effort):
-            count = len(values)
+            count = values.size
             parts.append(_OWN.length.pack(count))
             if count:
                 parts += (bytes(-at % 8), values.tobytes())

@@ -67,13 +67,20 @@ def test_distributed_equals_local(graph: Any, case: str) -> None:
 
 
 def test_distributed_equals_local_with_lanes(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
     values = {"kp": (9.4, 5.0, 2.0), "alpha": (0.3, 0.2, 0.0), "effort_max": (4.0, 3.0, math.inf)}
     gains = load_case("p1-c0.5").gains.with_values(**values)
+    states = graph.collect("controller_state", JointState)
     y, u = run_short(graph, "p1-c0.5", lanes=3, **values)
     local = load_short("p1-c0.5").simulate("short", gains)
     assert np.array_equal(y, local.output)
     assert np.array_equal(u, local.control_effort)
     assert u.max(axis=0)[:2].tolist() == [4.0, 3.0]
+    graph.wait_until(lambda: states and stamps(states)[-1] == (len(y) - 1) * load_case("p1-c0.5").sample_period_ns)
+    terms = dict(zip(states[-1].name, states[-1].position, strict=True))
+    assert [terms[f"error/{lane}"] for lane in range(3)] == (1.0 - y[-1]).tolist()
+    assert terms["unlimited_effort/2"] == u[-1, 2]
 
 
 def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> None:
