@@ -59,9 +59,9 @@ class SignalReader:
     """Reads the messages of one topic, whose frame and names are mostly as in the message before."""
 
     def __init__(self) -> None:
-        self._head = self._labels = b"?"  # no message begins so
+        self._head = self._labels = b"?"  # no message before this one
         self._order = _OWN
-        self._end = 0  # of the labels
+        self._end = sys.maxsize  # of the labels
         self._frame_id = ""
         self._name: tuple[str, ...] = ()
 
@@ -69,17 +69,19 @@ class SignalReader:
         """The sample in a serialized message.
 
         Raises:
-            ValueError: it is not a JointState in plain CDR.
+            ValueError: it is not a JointState in plain CDR, or its stamp has a second of more than 1e9 ns.
         """
         try:
             if not (data.startswith(self._head) and data.startswith(self._labels, _LABELS)):
                 self._read_labels(data)
             seconds, nanoseconds = self._order.stamp.unpack_from(data, _STAMP)
+            if nanoseconds >= SECOND:
+                raise ValueError
             position, at = self._values(data, self._end)
             velocity, at = self._values(data, at)
             effort, at = self._values(data, at)
         except (struct.error, ValueError, KeyError):
-            raise ValueError(f"its {len(data)} bytes are not a JointState in plain CDR") from None
+            raise ValueError(f"its {len(data)} bytes are not a valid JointState in plain CDR") from None
         return Sample(seconds * SECOND + nanoseconds, self._frame_id, self._name, position, velocity, effort)
 
     def _values(self, data: bytes, at: int) -> tuple[np.ndarray, int]:
@@ -109,7 +111,7 @@ def _string(data: bytes, at: int, length: struct.Struct) -> tuple[str, int]:
     at += 4
     if size > len(data) - at:
         raise ValueError("the string does not end within the message")
-    return data[at : at + max(size - 1, 0)].decode(), at + size + -size % 4
+    return data[at : at + max(size - 1, 0)].decode(errors="replace"), at + size + -size % 4
 
 
 class SignalWriter:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def test_a_message_cut_short_is_refused_and_the_next_one_read(sample: Sample, da
     whole = writer.write(sample.stamp_ns, sample.position, sample.velocity, sample.effort)
     cut = data.draw(st.integers(0, len(whole) - 1))
     for _ in range(2):
-        with pytest.raises(ValueError, match=f"its {cut} bytes are not a JointState"):
+        with pytest.raises(ValueError, match=f"its {cut} bytes are not a valid JointState"):
             reader.read(whole[:cut])
         assert is_same(reader.read(whole), sample)
 
@@ -76,15 +77,24 @@ def test_any_bytes_are_a_signal_or_refused(data: bytes) -> None:
         try:
             sample = reader.read(head + data)
         except ValueError as error:
-            assert "not a JointState" in str(error)
+            assert "not a valid JointState" in str(error)
         else:
             assert len(sample.position) <= len(data) / 8
 
 
-def test_other_encodings_are_refused() -> None:
+def test_other_encodings_and_stamps_that_are_none_are_refused() -> None:
     data = SignalWriter().write(0)
-    with pytest.raises(ValueError, match="not a JointState in plain CDR"):
-        SignalReader().read(b"\0\7" + data[2:])
+    hostile = [b"\0\7" + data[2:], b"?\0\0\0" + b"\0" * 8 + b"?" + b"\0" * 600]
+    hostile += [data[:8] + nanoseconds.to_bytes(4, sys.byteorder) + data[12:] for nanoseconds in (10**9, 2**32 - 1)]
+    for bytes_ in hostile:
+        with pytest.raises(ValueError, match="not a valid JointState in plain CDR"):
+            SignalReader().read(bytes_)
+
+
+def test_a_name_that_is_not_utf_8_is_read() -> None:
+    writer = SignalWriter()
+    writer.label("abc", ["elbow"])
+    assert SignalReader().read(writer.write(0).replace(b"elbow", b"\xe9lbow")).name == ("\ufffdlbow",)
 
 
 def test_values_are_the_signals_own() -> None:

@@ -124,7 +124,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             try:
                 sample = reader.read(data)
             except ValueError as error:
-                self.refuse("rejected", f"{topic} refused", f": {error}")
+                self.refuse("rejected", f"unreadable {topic} refused", f": {error}")
             else:
                 callback(sample)
 

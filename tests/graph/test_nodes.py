@@ -265,6 +265,13 @@ class TestController:
         assert loop.process.log.count("output that is not finite refused") == 1
         assert "output refused: it has 0 values for 1 lanes" in loop.process.log
 
+    def test_an_output_of_no_valid_time_is_refused(self, loop: Any) -> None:
+        latest = self.answer(loop, 0.1)
+        message = output_message(loop.time_ns, 0.1)
+        message.header.stamp.sec, message.header.stamp.nanosec = 2**31 - 1, 2**32 - 1
+        self.wait_for_rejection(loop, loop.output, message)
+        assert self.answer_again(loop, 0.1).effort == latest.effort
+
     def test_bad_setpoints_are_refused(self, loop: Any) -> None:
         from sensor_msgs.msg import JointState
 
