@@ -17,7 +17,8 @@ METHOD = (
 )
 PEERS = ("cma", "scipy")
 NOTES = (
-    "Half of a run on the linear rows is the HGA's own arithmetic between evaluations: its polish asks for few candidates at "
+    "A quarter of a run on the linear rows is the HGA's own arithmetic between evaluations, half of it before its Cholesky "
+    "factors were compiled. Its polish asks for few candidates at "
     "a time, which costs more calls and fewer evaluations to the target than DE's whole generations. On the circuit, of "
     "which an episode has 30,000 steps, the evaluations prevail.",
 )

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tdof_npid_ros.compiled import entry_point
+
 Array = NDArray[np.float64]
 
 RIDGE = 1e-9
@@ -84,30 +86,54 @@ def _regularised_cholesky(matrix: Array) -> Array:
 
 def _cholesky(matrix: Array) -> Array | None:
     """Lower factor of a symmetric matrix, or None where it is not positive definite."""
-    rest = matrix.copy()
-    lower = np.zeros_like(rest)
-    for j in range(len(rest)):
-        pivot = rest[j, j]
-        if not pivot > 0.0:
-            return None
-        lower[j:, j] = rest[j:, j] / np.sqrt(pivot)
-        rest[j:, j:] -= lower[j:, j, None] * lower[None, j:, j]
-    return lower
+    lower = np.zeros_like(matrix)
+    return lower if _factorise(matrix.copy(), lower) else None
+
+
+@entry_point
+def _factorise(rest: Array, lower: Array) -> bool:
+    """Write the lower factor of `rest`, which is used up; False where it is not positive definite."""
+    n = len(rest)
+    for j in range(n):
+        if not rest[j, j] > 0.0:
+            return False
+        root = np.sqrt(rest[j, j])
+        for i in range(j, n):
+            lower[i, j] = rest[i, j] / root
+        for i in range(j, n):
+            for k in range(j, n):
+                rest[i, k] -= lower[i, j] * lower[k, j]
+    return True
 
 
 def _forward(lower: Array, right: Array) -> Array:
     """Solve L x = right, right [n] or [n, k]."""
-    x = right.copy()
-    for j in range(len(lower)):
-        x[j] = x[j] / lower[j, j]
-        x[j + 1 :] -= np.multiply.outer(lower[j + 1 :, j], x[j])
-    return x
+    x = right.reshape(len(right), -1).copy()
+    _substitute_forward(lower, x)
+    return x.reshape(right.shape)
+
+
+@entry_point
+def _substitute_forward(lower: Array, x: Array) -> None:
+    n, columns = x.shape
+    for j in range(n):
+        for k in range(columns):
+            x[j, k] /= lower[j, j]
+        for i in range(j + 1, n):
+            for k in range(columns):
+                x[i, k] -= lower[i, j] * x[j, k]
 
 
 def _backward(lower: Array, right: Array) -> Array:
     """Solve Lᵀ x = right, right [n]."""
     x = right.copy()
-    for j in range(len(lower) - 1, -1, -1):
-        x[j] = x[j] / lower[j, j]
-        x[:j] -= lower[j, :j] * x[j]
+    _substitute_backward(lower, x)
     return x
+
+
+@entry_point
+def _substitute_backward(lower: Array, x: Array) -> None:
+    for j in range(len(x) - 1, -1, -1):
+        x[j] /= lower[j, j]
+        for i in range(j):
+            x[i] -= lower[j, i] * x[j]
