@@ -11,15 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tdof_npid_ros.signals import NO_VALUES, Sample, SignalReader, SignalWriter
+from tdof_npid_ros.signals import JOINT_STATE, NO_VALUES, SECOND, Sample, SignalReader, SignalWriter
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-JOINT_STATE = "sensor_msgs/msg/JointState"
 words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)
 values = st.lists(st.floats(width=64), max_size=5).map(np.array).map(np.float64)
 samples = st.builds(
     Sample,
-    stamp_ns=st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9),
+    stamp_ns=st.integers(-(2**31) * SECOND, (2**31 - 1) * SECOND),
     frame_id=words,
     name=st.lists(words, max_size=4).map(tuple),
     position=values,
@@ -30,7 +29,7 @@ samples = st.builds(
 
 def serialized(sample: Sample, little_endian: bool = True) -> bytes:
     of: Any = TYPES.types
-    seconds, nanoseconds = divmod(sample.stamp_ns, 10**9)
+    seconds, nanoseconds = divmod(sample.stamp_ns, SECOND)
     header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](seconds, nanoseconds), sample.frame_id)
     message = of[JOINT_STATE](header, list(sample.name), sample.position, sample.velocity, sample.effort)
     return bytes(TYPES.serialize_cdr(message, JOINT_STATE, little_endian=little_endian))

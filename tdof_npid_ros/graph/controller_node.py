@@ -21,10 +21,7 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import (
-    lane_names,
-    plan_from_message,
-)
+from tdof_npid_ros.graph.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.node import (
     ERROR,
     LATCHED_QOS,
