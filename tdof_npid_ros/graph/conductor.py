@@ -87,7 +87,7 @@ class Conductor:
         """
         request = SetParametersAtomically.Request()
         request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
-        result = self._call(SetParametersAtomically, f"{node}/set_parameters_atomically", request, timeout).result
+        result = self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request, timeout).result
         if not result.successful:
             raise LoopError(f"{node} refused {', '.join(parameters)}: {result.reason}")
 
@@ -97,11 +97,19 @@ class Conductor:
         Raises:
             LoopError: it reports a failure.
         """
-        response = self._call(Trigger, service, Trigger.Request(), timeout)
+        response = self.call(Trigger, service, Trigger.Request(), timeout)
         if not response.success:
             raise LoopError(f"{service}: {response.message}")
 
-    def _call(self, kind: Any, service: str, request: Any, timeout: float) -> Any:
+    def call(self, kind: Any, service: str, request: Any, timeout: float = 10.0) -> Any:
+        """A service's answer.
+
+        Args:
+            kind: the service's type.
+
+        Raises:
+            LoopError: there is none within `timeout` seconds.
+        """
         client = self._node.create_client(kind, service)
         try:
             self.wait(client.service_is_ready, f"the service {service}", timeout)

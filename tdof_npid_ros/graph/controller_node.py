@@ -21,20 +21,18 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
 from tdof_npid_ros.graph.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.node import (
     ERROR,
     LATCHED_QOS,
     OK,
-    RECENT,
     SIGNAL_QOS,
     STEADY,
     WARN,
-    LoopNode,
     number,
     run_node,
 )
-from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.signals import NO_VALUES, Sample, SignalWriter
 
@@ -64,11 +62,11 @@ DESCRIPTIONS = {
     "angle": "true: setpoint and output are angles in rad, the error is the shorter way round",
     "bumpless": "true: changes of gains and type do not move the effort at once",
 }
-SECONDS = {"output_timeout": (0.0, 3600.0), "deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}
+RANGES = {"output_timeout": (0.0, 3600.0), **TIMING_RANGES}
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
 
-class ControllerNode(LoopNode):
+class ControllerNode(LoopEnd):
     """Takes `output`, `setpoint` and `scenario_plan`; publishes `control_effort` and `controller_state`."""
 
     def __init__(self) -> None:
@@ -106,22 +104,11 @@ class ControllerNode(LoopNode):
         declare(
             "joint_names", [""], "joints of output and setpoint that are the lanes; none: all, in order", fixed=True
         )
-        declare("deadline", 0.0, "s between two efforts that is promised on control_effort; 0: no promise", fixed=True)
-        declare("lease", 1.0, "s; lease of the liveliness promised on control_effort; 0: no promise", fixed=True)
-        declare(
-            "request_deadline",
-            False,
-            "take output only from publishers that promise this deadline and lease",
-            fixed=True,
-        )
-        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
-        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
+        self.declare_timing("control_effort", "output")
 
     def activate(self) -> None:
         """Create topics, services and timers."""
-        p = self.values_of(["deadline", "lease", "request_deadline", "priority", "cpu"])
-        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
-            self.get_logger().warning(refusal)
+        self.prepare_for_realtime()
         self.stamps.forget()
         self.controller.reset()
         self.takes_output_as_setpoint = bool(self.values_of(["hold_output"])["hold_output"])
@@ -133,14 +120,13 @@ class ControllerNode(LoopNode):
         self.answer = b""
         self.terms = SignalWriter()
         self.terms_for = 0
-        effort_qos = signal_qos(1000, p["deadline"], p["lease"])
-        recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
-        self.effort_publisher = self.publisher_of(JointState, "control_effort", effort_qos, self._on_effort_matched)
+        qos = self.promised_qos()
+        self.effort_publisher = self.publisher_of(JointState, "control_effort", qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         self.subscribe_signal("setpoint", self._on_setpoint, signal_qos(10))
         self.subscribe_signal("manual_effort", self._on_manual_effort, signal_qos(1))
-        self.subscribe_signal("output", self._on_output, recent, sole=True)
+        self.subscribe_signal("output", self._on_output, self.requested_qos(), sole=True)
         self.create_timer(SILENCE_LOOKS, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:
@@ -308,8 +294,8 @@ class ControllerNode(LoopNode):
             raise ValueError(
                 f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or one per lane"
             )
-        p = {**self.values_of(list(SECONDS)), **changes}
-        for name, (low, high) in SECONDS.items():
+        p = {**self.values_of(list(RANGES)), **changes}
+        for name, (low, high) in RANGES.items():
             number(name, p[name], low, high)
 
     def changed(self, changes: dict[str, Any]) -> None:

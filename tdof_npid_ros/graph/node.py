@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -25,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
-from tdof_npid_ros.graph.messages import all_within, diagnostics_message
+from tdof_npid_ros.graph.messages import diagnostics_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
 from tdof_npid_ros.signals import Sample, SignalReader
@@ -129,17 +128,6 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
                 callback(sample)
 
         self.subscribe(JointState, topic, on_data, qos, sole, raw=True)
-        all_within(np.zeros(1), 1.0)  # compiles, too
-
-    def is_sound(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
-        """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""
-        if len(values) != lanes:
-            self.refuse("rejected", f"{topic} refused", f": it has {len(values)} values for {lanes} lanes")
-        elif not all_within(values, largest):
-            self.refuse("rejected", f"{topic} that is not finite refused")
-        else:
-            return True
-        return False
 
     # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due before.
 

@@ -11,12 +11,11 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
-from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
 from tdof_npid_ros.graph.messages import lane_names
-from tdof_npid_ros.graph.node import LoopNode, number, run_node
+from tdof_npid_ros.graph.node import number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
-from tdof_npid_ros.graph.timing import prepare_for_realtime
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
@@ -31,12 +30,11 @@ RANGES = {
     "effort_timeout": (0.0, 3600.0),
     "return_time": (0.0, 3600.0),
     "fallback_effort": (-1e300, 1e300),
-    "deadline": (0.0, 3600.0),
-    "lease": (0.0, 3600.0),
+    **TIMING_RANGES,
 }
 
 
-class PlantNode(LoopNode):
+class PlantNode(LoopEnd):
     """Publishes `output`, takes `control_effort` and `disturbance`; `plant/reset` starts it over."""
 
     def __init__(self) -> None:
@@ -84,26 +82,12 @@ class PlantNode(LoopNode):
         )
         declare("fallback_effort", 0.0, "realtime: effort without a controller")
         declare("return_time", 0.5, "realtime: s in which the plant goes over to efforts that come again")
-        declare(
-            "deadline", 0.0, "realtime: s between two outputs that is promised on output; 0: no promise", fixed=True
-        )
-        declare("lease", 1.0, "s; lease of the liveliness that is promised on output; 0: no promise", fixed=True)
-        declare(
-            "request_deadline",
-            False,
-            "realtime: take control_effort only from publishers that promise this deadline and lease",
-            fixed=True,
-        )
-        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
-        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
+        self.declare_timing("output", "control_effort")
 
     def activate(self) -> None:
         """Create topics, services and timers."""
-        p = self.values_of(["deadline", "lease", "priority", "cpu"])
-        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
-            self.get_logger().warning(refusal)
-        deadline = p["deadline"] if self.mode == "realtime" else 0.0
-        qos = signal_qos(1000, deadline, p["lease"])
+        self.prepare_for_realtime()
+        qos = self.promised_qos(with_deadline=self.mode == "realtime")
         self.output_publisher = self.publisher_of(JointState, "output", qos, matched=self.way_of_running.on_matched)
         self.create_service(Trigger, "plant/reset", self._on_reset)
         self.way_of_running.activate()

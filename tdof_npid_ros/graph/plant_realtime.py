@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.node import ERROR, OK, RECENT, STEADY, WARN
+from tdof_npid_ros.graph.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.timing import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
 from tdof_npid_ros.signals import Sample
@@ -25,12 +25,10 @@ class RealtimePlant:
     def activate(self) -> None:
         """Create the topics and the timer."""
         node = self._node
-        p = node.values_of(["speed", "deadline", "lease", "request_deadline"])
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
-        self.wall_period_ns = max(1, round(node.period_ns / p["speed"]))
+        self.wall_period_ns = max(1, round(node.period_ns / node.values_of(["speed"])["speed"]))
         self.reset()
-        recent = signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else signal_qos(RECENT)
-        node.subscribe_signal("control_effort", self._on_effort, recent, sole=True)
+        node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(), sole=True)
         node.subscribe_signal("disturbance", self._on_disturbance, signal_qos(1))
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
 

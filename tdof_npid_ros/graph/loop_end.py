@@ -1,0 +1,61 @@
+"""What plant and controller, the two ends of the loop, share: promises of their timing, checks of what they take."""
+
+from __future__ import annotations
+
+import numpy as np
+from rclpy.qos import QoSProfile
+
+from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.messages import all_within
+from tdof_npid_ros.graph.node import RECENT, RECENT_QOS, LoopNode
+from tdof_npid_ros.graph.timing import prepare_for_realtime
+
+TIMING_RANGES = {"deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}  # s
+
+
+class LoopEnd(LoopNode):
+    """A node that answers each signal with another one."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        all_within(np.zeros(1), 1.0)  # compiles
+
+    def declare_timing(self, published: str, taken: str) -> None:
+        """Declare the parameters of what the topic `published` promises, `taken` has to, and the processor allows."""
+        declare = self.declare_value
+        declare("deadline", 0.0, f"realtime: s from one {published} to the next, as it promises; 0: no promise", fixed=True)
+        declare("lease", 1.0, f"s; lease of the liveliness that {published} promises; 0: no promise", fixed=True)
+        declare(
+            "request_deadline",
+            False,
+            f"realtime: take {taken} only from publishers that promise this deadline and lease",
+            fixed=True,
+        )
+        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
+        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
+
+    def prepare_for_realtime(self) -> None:
+        """Take the priority and the processor asked for; log what the system does not allow."""
+        p = self.values_of(["priority", "cpu"])
+        for refusal in prepare_for_realtime(p["priority"], p["cpu"]):
+            self.get_logger().warning(refusal)
+
+    def promised_qos(self, with_deadline: bool = True) -> QoSProfile:
+        """Of the topic that is published."""
+        p = self.values_of(["deadline", "lease"])
+        return signal_qos(1000, p["deadline"] if with_deadline else 0.0, p["lease"])
+
+    def requested_qos(self) -> QoSProfile:
+        """Of the topic that is taken."""
+        p = self.values_of(["deadline", "lease", "request_deadline"])
+        return signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else RECENT_QOS
+
+    def is_sound(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
+        """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""
+        if len(values) != lanes:
+            self.refuse("rejected", f"{topic} refused", f": it has {len(values)} values for {lanes} lanes")
+        elif not all_within(values, largest):
+            self.refuse("rejected", f"{topic} that is not finite refused")
+        else:
+            return True
+        return False
