@@ -97,7 +97,7 @@ class NodeProcess:
         return not self.stopped and self.expected_status == 0 and self.process.poll() is not None
 
     def stop(self, timeout: float = 10.0) -> float:
-        """Ctrl-C; returns after how many seconds the process had ended."""
+        """Ctrl-C; returns after how many seconds the process had ended. One that hangs tells in its log where."""
         began, self.stopped = time.monotonic(), True
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
@@ -105,7 +105,7 @@ class NodeProcess:
         try:
             self.process.wait(timeout)
         except subprocess.TimeoutExpired:
-            self.process.kill()
+            self.process.send_signal(signal.SIGABRT)  # Python's fault handler prints what each thread does
             self.process.wait()
         return time.monotonic() - began
 
@@ -130,6 +130,7 @@ class Graph:
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONFAULTHANDLER": "1",
             "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]),
         }
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
