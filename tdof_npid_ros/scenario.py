@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,9 @@ GRAMMAR = (
 )
 
 
+_EPISODE = re.compile(r"[0-9a-f]{12}/[0-9]+")
+
+
 class PlanError(ValueError):
     """A plan that cannot be run; the message quotes the line that is wrong."""
 
@@ -45,6 +49,11 @@ class Segment(NamedTuple):
     first: int
     last: int
     plant: dict[str, float]
+
+
+def episode_named(frame_id: str) -> str:
+    """The episode `<plan digest>/<number>` that a `header.frame_id` names; empty if it is a robot's frame, say."""
+    return frame_id if _EPISODE.fullmatch(frame_id) else ""
 
 
 @dataclass(frozen=True)

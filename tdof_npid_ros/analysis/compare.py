@@ -11,6 +11,7 @@ import numpy as np
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.scenario import episode_named
 from tdof_npid_ros.signals import SignalReader
 
 Key = tuple[str, int]  # episode and stamp in ns
@@ -54,7 +55,7 @@ class Recorded:
             sample = SignalReader().read(output)
         except ValueError:
             return None  # nobody could read it
-        key = sample.frame_id if "/" in sample.frame_id else "", sample.stamp_ns  # a robot's frame is no episode
+        key = episode_named(sample.frame_id), sample.stamp_ns
         return key if key in self.answers else None
 
 

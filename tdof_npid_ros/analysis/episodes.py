@@ -16,7 +16,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.stamps import RESTART_NS
-from tdof_npid_ros.scenario import Plan, parse_plan
+from tdof_npid_ros.scenario import Plan, episode_named, parse_plan
 
 UNPLANNED = "recording"  # the name of an episode without a plan
 
@@ -102,13 +102,12 @@ def _episodes(loop: Loop) -> Iterator[Episode]:
         by_episode[_episode_of(answers, stretch)].append(stretch)  # type: ignore[arg-type]
     known = configurations(loop.histories)
     for count, stretch in enumerate(_stretches(loop.output), start=1):
-        frame = str(loop.output.frame_id[stretch.start])
-        planned = "/" in frame
-        if planned:
-            mine = by_episode[frame].pop(0) if by_episode[frame] else slice(0, 0)
+        name = _episode_of(loop.output, stretch)
+        if name:
+            mine = by_episode[name].pop(0) if by_episode[name] else slice(0, 0)
         else:
             mine = _published_during(loop.output, stretch, answers)
-        episode = _episode(loop, stretch, frame if planned else "", count, answers, mine, known, names)
+        episode = _episode(loop, stretch, name, count, answers, mine, known, names)
         if episode is not None:
             yield episode
 
@@ -130,7 +129,7 @@ def _stretches(signal: Signal) -> list[slice]:
 
 def _episode_of(signal: Signal, stretch: slice) -> str:
     """What a frame_id says of the episode, after the digest of the parameters that an answer has before it."""
-    return str(signal.frame_id[stretch.start]).rpartition(" ")[2] if "/" in signal.frame_id[stretch.start] else ""
+    return episode_named(str(signal.frame_id[stretch.start]).rpartition(" ")[2])
 
 
 def _published_during(output: Signal, stretch: slice, answers: Signal | None) -> slice:

@@ -22,7 +22,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.stamps import Stamps, Verdict, begins_from_nothing
-from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.scenario import Plan, episode_named
 
 # Why an answer cannot be verified.
 NO_PARAMETERS = "the parameters that they bear the digest of are not in the bag"
@@ -257,8 +257,7 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
     outputs = loop.output
     places: dict[tuple[str, int], list[int]] = defaultdict(list)  # of the outputs, latest first
     for i in range(len(outputs) - 1, -1, -1):
-        frame = str(outputs.frame_id[i])  # of a robot it is not the name of an episode
-        places[frame if "/" in frame else "", int(outputs.stamp_ns[i])].append(i)
+        places[episode_named(str(outputs.frame_id[i])), int(outputs.stamp_ns[i])].append(i)
     latest = before = 0
     for step, (frame, stamp, sequence) in enumerate(
         zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)

@@ -33,7 +33,7 @@ from tdof_npid_ros.graph.node import (
     number,
     run_node,
 )
-from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.scenario import Plan, episode_named
 from tdof_npid_ros.signals import NO_VALUES, Sample, SignalWriter
 
 DESCRIPTIONS = {
@@ -167,18 +167,17 @@ class ControllerNode(LoopEnd):
             self.counts["rejected"] += 1
 
     def _on_output(self, output: Sample) -> None:
-        stamp, episode = output.stamp_ns, output.frame_id
+        stamp, episode = output.stamp_ns, episode_named(output.frame_id)
         y = self._picked("output", output.name, output.position)
         if y is None or not self.is_sound("output", y, self.controller.lanes, LARGEST_SIGNAL):
             return
-        if "/" in episode:
+        if episode:
             if self.plan is None or not episode.startswith(self.plan.digest):
                 self.waiting = output  # its plan is on the way
                 return
             self.waiting = None
             setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
-            episode = ""  # a robot's frame
             if self.takes_output_as_setpoint:
                 self._take_setpoint(y)
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
@@ -242,7 +241,7 @@ class ControllerNode(LoopEnd):
 
     def _on_effort_matched(self, status: Any) -> None:
         """A reader of `control_effort` has come. A plant in lockstep may be waiting for what it could not hear yet."""
-        if status.current_count_change > 0 and "/" in self.effort_for[1]:
+        if status.current_count_change > 0 and self.effort_for[1]:
             self.effort_publisher.publish(self.answer)
 
     def _note_answer(self, stamp: int, is_new: bool) -> None:
@@ -265,7 +264,7 @@ class ControllerNode(LoopEnd):
             return None
 
     def _look_for_silence(self) -> None:
-        if self.silent or not self.output_timeout_ns or self.latest_arrival_ns is None or "/" in self.effort_for[1]:
+        if self.silent or not self.output_timeout_ns or self.latest_arrival_ns is None or self.effort_for[1]:
             return
         if time.monotonic_ns() - self.latest_arrival_ns > self.output_timeout_ns:
             self.silent = True
@@ -326,7 +325,7 @@ class ControllerNode(LoopEnd):
     @property
     def _answers_live_outputs(self) -> bool:
         """Whether it is in a loop in realtime, whose number of lanes is not ours to change."""
-        return self.active and self.latest_arrival_ns is not None and "/" not in self.effort_for[1] and not self.silent
+        return self.active and self.latest_arrival_ns is not None and not self.effort_for[1] and not self.silent
 
     def _setpoint(self, value: Any) -> np.ndarray:
         one_per_lane = value if isinstance(value, list) else [value]

@@ -91,6 +91,15 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         """Level, one line for an operator, and facts, for the diagnostics."""
         return OK, "", {}
 
+    def destroy_node(self) -> None:
+        """As `Node.destroy_node`, and leave the DDS domain.
+
+        rclpy forgets a managed node's state machine, which keeps the node in the domain until C++'s static objects are
+        destroyed at the end of the process; there Fast DDS hangs now and then.
+        """
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     # Topics
 
     def publisher_of(

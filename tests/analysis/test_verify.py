@@ -163,7 +163,7 @@ def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_actio
                 controller.change(case.gains, operation)
             controller.answer(stamp, np.ones(1), y)
             begun = controller.integral_before if k == 0 else ()
-            bag.write("output", JOINT_STATE, joint_state(stamp, "base_link", y, [0.3]))
+            bag.write("output", JOINT_STATE, joint_state(stamp, "robot1/base_link", y, [0.3]))
             answer = joint_state(stamp, controller.digest, [1.0], controller.effort, begun)
             bag.write("control_effort", JOINT_STATE, answer)
     assert verify.verify(tmp_path / "bag").equal == 300

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -111,6 +113,32 @@ def test_ctrl_c_again_and_again_while_it_is_loaded(graph: Any) -> None:
         process.send(signal.SIGINT)
         graph.spin_once(0.01)
     assert (process.process.returncode, process.log) == (0, "")
+
+
+OUTLIVED = """
+import rclpy
+from tdof_npid_ros.graph.plant_node import PlantNode
+rclpy.init()
+node = PlantNode()
+node.trigger_configure()
+node.trigger_activate()
+input()
+node.destroy_node()
+input()
+"""
+
+
+def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) -> None:
+    command = [sys.executable, "-c", OUTLIVED]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, env=graph.environment, text=True) as process:
+        assert process.stdin is not None
+        graph.wait_until(lambda: "plant" in graph.node.get_node_names(), 60, "the plant")
+        process.stdin.write("\n")
+        process.stdin.flush()
+        graph.wait_until(lambda: "plant" not in graph.node.get_node_names(), 30, "the plant's leaving")
+        assert process.poll() is None
+        process.communicate("\n", timeout=30)
+    assert process.returncode == 0
 
 
 def test_controller_killed_and_restarted(graph: Any) -> None:

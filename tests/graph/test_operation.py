@@ -242,7 +242,7 @@ def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
                              joint_names=["elbow", "wrist"], setpoint=[1.0, 2.0], effort_max=[5.0, 1.25])  # fmt: skip
     joint_states = graph.publisher("joint_states", JointState)
     message = JointState(name=["base", "wrist", "elbow"], position=[9.0, 1.5, 0.25], velocity=[0.0] * 3)
-    message.header.frame_id = "base_link"
+    message.header.frame_id = "robot1/base_link"
     graph.publish_until(joint_states, message, lambda: efforts, what="an effort")
     assert list(efforts[0].name) == ["elbow", "wrist"]
     assert list(efforts[0].effort) == [2.0 * 0.75, 1.25]

@@ -109,7 +109,7 @@ def test_a_robots_joint_states_are_given_to_the_controller(graph: Any, tmp_path:
         for k in range(100):
             stamp, y = k * CASE.sample_period_ns, np.array([np.sin(k / 30)])
             controller.answer(stamp, np.zeros(1), y)
-            writer.write("joint_states", JOINT_STATE, joint_state(stamp, "base_link", y))
+            writer.write("joint_states", JOINT_STATE, joint_state(stamp, "robot1/base_link", y))
             answer = joint_state(stamp, controller.digest, [0.0], controller.effort)
             writer.write("control_effort", JOINT_STATE, answer)
     graph.start("controller", "-r", "output:=joint_states", case="p1-c0.5")
