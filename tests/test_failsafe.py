@@ -24,6 +24,18 @@ def test_after_the_timeout_it_takes_the_fallback_or_holds(fallback: float | None
     assert failsafe.effort_at(101 * MS) == [then] and failsafe.silent
 
 
+def test_another_fallback_holds_at_once_where_the_fallback_is_in_force() -> None:
+    failsafe = FailSafe(1, 100 * MS, 0.0, 100 * MS)
+    failsafe.change(100 * MS, 0.5, 100 * MS)
+    assert failsafe.effort_at(0) == [0.5]
+    failsafe.take(np.ones(1), 0)
+    failsafe.change(100 * MS, 0.25, 100 * MS)
+    assert failsafe.effort_at(50 * MS) == [1.0]
+    assert failsafe.effort_at(101 * MS) == [0.25] and failsafe.silent
+    failsafe.change(100 * MS, 0.75, 100 * MS)
+    assert failsafe.effort_at(110 * MS) == [0.75]
+
+
 def test_it_goes_over_to_new_efforts_without_a_jump() -> None:
     failsafe = FailSafe(2, 100 * MS, 0.0, 200 * MS)
     failsafe.take(np.ones(2), 0)

@@ -200,6 +200,8 @@ class AlternateLoop:
                 raise LoopLostError(f"no output in {self._namespace} for {self._answer_timeout:g} s")
 
     def _on_output(self, message: JointState) -> None:
+        if not message.position:
+            return
         self._outputs += 1
         now, output = stamp_ns(message.header.stamp) / 1e9, message.position[0]
         watching = self._watching
@@ -222,8 +224,8 @@ class AlternateLoop:
             self._ended.set()
 
     def _on_controller_state(self, message: JointState) -> None:
-        if "integral" in message.name:
-            self._integral = message.position[message.name.index("integral")]
+        terms = dict(zip(message.name, message.position, strict=False))
+        self._integral = terms.get("integral", self._integral)
 
     def _publish_setpoint(self, setpoint: float) -> None:
         message = signal_message("")

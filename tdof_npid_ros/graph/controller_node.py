@@ -110,6 +110,8 @@ class ControllerNode(LoopEnd):
         """Create topics, services and timers."""
         self.prepare_for_realtime()
         self.stamps.forget()
+        self.waiting = None
+        self.answered = NO_VALUES  # the latest output that was
         self.controller.reset()
         self.takes_output_as_setpoint = bool(self.values_of(["hold_output"])["hold_output"])
         self.latest_arrival_ns: int | None = None
@@ -161,7 +163,10 @@ class ControllerNode(LoopEnd):
         self.setpoint, self.takes_output_as_setpoint = setpoint, False
 
     def _on_manual_effort(self, sample: Sample) -> None:
-        effort = sample.effort.tolist()
+        values = self._picked("manual_effort", sample.name, sample.effort)
+        if values is None:
+            return
+        effort = values.tolist()
         parameter = Parameter("manual_effort", value=effort if len(effort) > 1 else effort[0] if effort else math.nan)
         if not self.set_parameters([parameter])[0].successful:
             self.counts["rejected"] += 1
@@ -178,6 +183,7 @@ class ControllerNode(LoopEnd):
             self.waiting = None
             setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
+            self.waiting = None
             if self.takes_output_as_setpoint:
                 self._take_setpoint(y)
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
@@ -185,6 +191,10 @@ class ControllerNode(LoopEnd):
         if verdict == "late":
             self.counts["late"] += 1
             return
+        if verdict == "same" and not episode and not np.array_equal(y, self.answered):
+            self.refuse("rejected", "output refused: it has changed, but its stamp has not", "; stamp each message")
+            return
+        self.answered = y
         begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, output)
         is_new = self.controller.answer(stamp, setpoint, y)
         if is_new:

@@ -9,7 +9,8 @@ import socket
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import rclpy
@@ -371,18 +372,21 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
     """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
     stop = Stop()
     node = None
+    status = 0
     try:
-        node = _started(make_node, arguments)
+        with _start_errors():
+            use_fast_dds_profile()
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+            node = make_node()
+            if node.autostart:
+                _autostart(node)
         spin(node, stop)
-        status = 0
     except StartError as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
         status = 2
     finally:
         if node is not None:
-            if node.active:
-                node.deactivate()
-            node.destroy_node()
+            _end(node)
         rclpy.try_shutdown()
         stop.ignore_further()
     sys.exit(status)
@@ -392,19 +396,27 @@ class StartError(RuntimeError):
     """A node that cannot start; the message says why."""
 
 
-def _started(make_node: Callable[[], LoopNode], arguments: list[str] | None) -> LoopNode:
-    use_fast_dds_profile()
+@contextmanager
+def _start_errors() -> Iterator[None]:
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        node = make_node()
-        if node.autostart:
-            node.trigger_configure()
-            node.trigger_activate()
-            if node.activation_error is not None:
-                raise node.activation_error
+        yield
     except (ValueError, OSError, RuntimeError) as error:
         raise StartError(" ".join(str(error).split())) from error
-    return node
+
+
+def _autostart(node: LoopNode) -> None:
+    node.trigger_configure()
+    node.trigger_activate()
+    if node.activation_error is not None:
+        raise node.activation_error
+
+
+def _end(node: LoopNode) -> None:
+    try:
+        if node.active:
+            node.deactivate()
+    finally:
+        node.destroy_node()
 
 
 class Stop:

@@ -82,14 +82,15 @@ class LockstepPlant:
         ):
             node.counts["late"] += 1
             return
-        if not node.takes("control_effort", answer.effort):
+        effort = node.effort_of(answer)
+        if effort is None:
             return
         if not self._is_logged(episode):
             return  # it comes again
         if self.stopped:
             node.get_logger().info("the controller answers again: going on")
             self.running, self.stopped = True, False
-        if episode.answer(answer.effort):
+        if episode.answer(effort):
             self._publish_when_logged(episode)
         else:
             self.running = False

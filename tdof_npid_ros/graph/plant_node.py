@@ -11,6 +11,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import sample_period_in_ns
+from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
 from tdof_npid_ros.graph.messages import lane_names
 from tdof_npid_ros.graph.node import number, run_node
@@ -19,7 +20,7 @@ from tdof_npid_ros.graph.plant_realtime import RealtimePlant
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
-from tdof_npid_ros.signals import SignalWriter
+from tdof_npid_ros.signals import Sample, SignalWriter
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 FALLBACKS = ("effort", "hold")
@@ -50,7 +51,7 @@ class PlantNode(LoopEnd):
             "lossless", False, "lockstep: never run ahead of what the recorder has got; needs a recorder", fixed=True
         )
         names = self.declare_value("joint_names", [""], "name of each lane in output; none: lane0, …", fixed=True)
-        self.joints = [str(name) for name in names if name]
+        self.joints = Joints([str(name) for name in names])
         self.checked({})
         self.accept_changes()
         self.output = SignalWriter()
@@ -103,6 +104,13 @@ class PlantNode(LoopEnd):
         """Whether there is one finite value per lane; else it is refused."""
         return self.is_sound(topic, effort, self.simulator.lanes, sys.float_info.max)
 
+    def effort_of(self, sample: Sample) -> np.ndarray | None:
+        """The control effort, (lanes,), by the joints' names where it bears them; None if it is refused."""
+        effort = sample.effort
+        if self.joints.names and set(sample.name) == set(self.joints.names):
+            effort = self.joints.picked(sample.name, effort)
+        return effort if self.takes("control_effort", effort) else None
+
     def plant_at(self, changes: dict[str, float]) -> Plant:
         """The plant with some parameters changed."""
         return make_plant(self.model, {**self.values_of(self.model_names), **changes})
@@ -114,7 +122,7 @@ class PlantNode(LoopEnd):
 
     def label_output(self, episode: str) -> None:
         """What the outputs bear in `header.frame_id` from now on, beside the names of the lanes."""
-        self.output.label(episode, self.joints or lane_names(self.simulator.lanes))
+        self.output.label(episode, self.joints.names or lane_names(self.simulator.lanes))
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
@@ -139,9 +147,9 @@ class PlantNode(LoopEnd):
             raise ValueError(f"fallback is {p['fallback']!r}: it must be one of {', '.join(FALLBACKS)}")
         if isinstance(p["lanes"], bool) or not isinstance(p["lanes"], int) or not 1 <= p["lanes"] <= 100_000:
             raise ValueError(f"lanes is {p['lanes']!r}: it must be a whole number from 1 to 100000")
-        if self.joints and len(self.joints) != p["lanes"]:
+        if self.joints.names and len(self.joints.names) != p["lanes"]:
             raise ValueError(
-                f"joint_names has {len(self.joints)} names, but lanes is {p['lanes']}: give one name per lane"
+                f"joint_names has {len(self.joints.names)} names, but lanes is {p['lanes']}: give one name per lane"
             )
         if not number("effort_min", p["effort_min"]) <= number("effort_max", p["effort_max"]):
             raise ValueError(

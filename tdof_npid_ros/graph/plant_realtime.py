@@ -80,13 +80,14 @@ class RealtimePlant:
             self.missed_ticks = missed
 
     def _on_effort(self, sample: Sample) -> None:
-        if not self._node.takes("control_effort", sample.effort):
+        effort = self._node.effort_of(sample)
+        if effort is None:
             return
         now = STEADY.now().nanoseconds
         stamp, published = self.output_ns
         if sample.stamp_ns == stamp:
             self.output_to_effort.add(now - published)
-        if self.failsafe.take(sample.effort, now):
+        if self.failsafe.take(effort, now):
             self._node.get_logger().info("control_effort comes again: going over to it")
 
     def _report_silence(self) -> None:

@@ -81,16 +81,17 @@ class NodeProcesses:
     def stop(self) -> None:
         """Interrupt one node after the other, the last started first, and wait for it; kill what does not end.
 
-        So a recorder that was started first hears all that the others had to say.
+        So a recorder that was started first hears all that the others had to say. Ctrl-C waits until all have ended.
         """
-        for process in reversed(self._processes.values()):
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-            try:
-                process.wait(STOP_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+        with _interrupted_afterwards():
+            for process in reversed(self._processes.values()):
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+                try:
+                    process.wait(STOP_TIMEOUT)
+                except subprocess.TimeoutExpired:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    process.wait()
 
     def __enter__(self) -> NodeProcesses:
         return self

@@ -291,10 +291,10 @@ class RecorderNode(LoopNode):
     def _fail(self, error: BagError) -> None:
         """Say so at once, and let go of the topics: a reader that does not read would hold the loop up."""
         self.failure = str(error)
-        self.get_logger().error(self.failure)
-        self.publish_diagnostics()
         if self.lossless:
             self._tell_progress(NO_LOG, 0)
+        self.get_logger().error(self.failure)
+        self.publish_diagnostics()
 
     def _let_go(self) -> None:
         self.discovery.cancel()
@@ -304,7 +304,7 @@ class RecorderNode(LoopNode):
     # State
 
     def _account(self) -> dict[str, str]:
-        missed = self.missed_by_topic + Counter({topic: tap.missed for topic, tap in self.taps.items()})
+        missed = self.missed_by_topic + Counter({topic: tap.missed for topic, tap in list(self.taps.items())})
         return {
             "namespace": self.get_namespace(),
             "recorded": str(self.counts["recorded"]),
@@ -315,7 +315,7 @@ class RecorderNode(LoopNode):
 
     def _losses(self) -> Counter[str]:
         """Messages lost so far, by topic; topics without are left out."""
-        return self.lost_by_topic + Counter({topic: tap.lost for topic, tap in self.taps.items()})
+        return self.lost_by_topic + Counter({topic: tap.lost for topic, tap in list(self.taps.items())})
 
     @property
     def lost(self) -> int:

@@ -121,7 +121,8 @@ class ReplayNode(LoopNode):
         except (BagError, TimeoutError) as error:
             self.get_logger().error(str(error))
             self.comparison.failure = str(error)
-        os.kill(os.getpid(), signal.SIGINT)  # ends the node in order, as Ctrl-C does
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)  # ends the node in order, as Ctrl-C does
 
     def _play_through(self) -> None:
         first_ns = self.reader.start_ns + round(self.start * SECOND)

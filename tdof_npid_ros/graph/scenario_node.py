@@ -48,7 +48,9 @@ class ScenarioNode(LoopNode):
             )
         self._read_plans({})
         self.accept_changes()
-        self.played = self.latest_episode = 0
+        self.played = 0
+        self.reported_episode = 0  # by the plant
+        self.latest_episode = self.finished_before = 0  # of the plant, that was played to its end; and before `current`
         self.queue: list[Plan] = []
         self.current: Plan | None = None
 
@@ -132,6 +134,9 @@ class ScenarioNode(LoopNode):
             except ValueError:
                 self.refuse("rejected", "diagnostics of the plant refused: its episode is no number")
                 continue
+            if episode < self.reported_episode:  # the plant has been started again, and counts anew
+                self.latest_episode = self.finished_before = 0
+            self.reported_episode = episode
             finished = facts.get("state") == "finished" and facts.get("plan") == getattr(self.current, "digest", None)
             if self.mode == "lockstep" and self.current and finished and episode > self.finished_before:
                 self.latest_episode = episode

@@ -31,8 +31,10 @@ class FailSafe:
         return self._latest_ns is not None
 
     def change(self, timeout_ns: int, fallback: float | None, return_ns: int) -> None:
-        """Go on with other settings."""
+        """Go on with other settings; where the fallback effort is in force, the new one is now."""
         self._timeout_ns, self._return_ns, self._fallback = timeout_ns, return_ns, fallback
+        if fallback is not None and (self.silent or not self.is_driven):
+            self._effort = np.full(self._effort.shape, fallback)
 
     def take(self, effort: np.ndarray, now_ns: int) -> bool:
         """Take a new effort, (lanes,), finite. Returns whether it ends a silence."""

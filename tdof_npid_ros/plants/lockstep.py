@@ -8,7 +8,7 @@ import numpy as np
 
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
-from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.scenario import Plan, episode_named
 
 PlantAt = Callable[[dict[str, float]], Plant]
 
@@ -35,7 +35,9 @@ class Episode:
 
     def awaits(self, stamp_ns: int, answer_name: str) -> bool:
         """Whether an answer of that stamp is the one; an answer that names an episode must name this one."""
-        return stamp_ns == self.stamp_ns and ("/" not in answer_name or answer_name.endswith(self.name))
+        if stamp_ns != self.stamp_ns:
+            return False
+        return answer_name.endswith(self.name) or not episode_named(answer_name.rpartition(" ")[2])
 
     def answer(self, effort: np.ndarray) -> bool:
         """Take the answer, (lanes,), and go on one step. Returns False if the episode ends with it."""

@@ -155,6 +155,20 @@ def test_controller_killed_and_restarted(graph: Any) -> None:
     graph.wait_until(lambda: int(graph.fact("/plant", "steps")) > before + 100, 60, "more steps")
 
 
+def test_a_plant_that_is_started_again_finishes_the_scenario(graph: Any) -> None:
+    plant = graph.start("plant", mode="lockstep")
+    graph.start("controller")
+    graph.start(
+        "scenario", mode="lockstep", episodes=["e", "f"], plan__e=["0 setpoint 1", "1 end"],
+        plan__f=["0 setpoint 2", "100 end"],
+    )  # fmt: skip
+    graph.wait_until(lambda: graph.fact("/plant", "episode") == "2", 60, "the second episode")
+    plant.send(signal.SIGKILL)
+    graph.start("plant", mode="lockstep")
+    graph.wait_until(lambda: graph.fact("/scenario", "played") == "1", 60, "the end of the scenario")
+    assert graph.fact("/plant", "episode") == "1"
+
+
 def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None:
     """The plant may be found after the controller has answered it; then it waits for that answer."""
     from sensor_msgs.msg import JointState

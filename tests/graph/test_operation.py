@@ -246,8 +246,28 @@ def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
     graph.publish_until(joint_states, message, lambda: efforts, what="an effort")
     assert list(efforts[0].name) == ["elbow", "wrist"]
     assert list(efforts[0].effort) == [2.0 * 0.75, 1.25]
+    unstamped = JointState(name=message.name, position=[9.0, 1.5, 0.5])
+    graph.publish_until(joint_states, unstamped, lambda: "its stamp has not; stamp each" in controller.log, what="that")
+    by_hand = JointState(name=["wrist", "elbow"], effort=[1.0, -1.0])
+    manual_effort = graph.publisher("manual_effort", JointState)
+    graph.publish_until(
+        manual_effort, by_hand, lambda: graph.get_parameters("/controller", "manual_effort") == [[-1.0, 1.0]]
+    )
     incomplete = JointState(name=["base", "elbow"], position=[0.0, 0.0])
     graph.publish_until(joint_states, incomplete, lambda: "has no joint wrist" in controller.log, what="a refusal")
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_plant_and_controller_may_name_the_joints_in_different_orders(graph: Any, mode: str) -> None:
+    from sensor_msgs.msg import JointState
+
+    outputs = graph.collect("output", JointState)
+    graph.start("plant", mode=mode, lanes=2, joint_names=["elbow", "wrist"], time_constant=0.5, dead_time=0.0)
+    graph.start("controller", joint_names=["wrist", "elbow"], type="pid", kp=[1.0, 3.0], ki=0.0, kd=0.0, setpoint=1.0)
+    if mode == "lockstep":
+        graph.start("scenario", mode=mode, episodes=["e"], plan__e=["0 setpoint 1", "60 end"])
+    rest = [3.0 / 4.0, 1.0 / 2.0]  # kp/(1 + kp)
+    graph.wait_until(lambda: outputs and np.allclose(outputs[-1].position, rest, atol=0.01), 60, f"{rest}")
 
 
 def test_the_first_output_is_held_until_a_setpoint_comes(graph: Any) -> None:
