@@ -67,7 +67,7 @@ def ping_rates(trips: dict[str, list[float]], lanes: int) -> list[Rate]:
 
 
 def steps_per_second(lanes: int, steps: int, recorded: bool) -> float:
-    """One episode of Process 1 through the nodes, from the command to its end."""
+    """One episode of Process 1 through the nodes, between the plant's reports that it has begun and ended."""
     with tempfile.TemporaryDirectory() as folder:
         return run_loop(Path(folder), steps, {} if recorded else None, lanes)
 

@@ -65,16 +65,18 @@ def _head(results: Mapping[str, Result]) -> list[str]:
     lines += [
         "",
         "All of it again: `make bench` (under half an hour on two quiet cores) writes this page; "
-        "`python -m benchmarks --only NAME` renews one section. The last sections take long and are measured by name only.",
+        "`python -m benchmarks --only NAME` renews one section. `make bench-long` renews what takes too long for that: seeds and "
+        "soak.",
         "",
         "## The machine",
         "",
     ]
-    machines = {json.dumps(r.circumstances["machine"]): r.circumstances["machine"] for r in results.values()}
-    for machine in machines.values():
-        lines += ["| | |", "| --- | --- |", *(f"| {key} | {value} |" for key, value in machine.items()), ""]
-    if len(machines) > 1:
-        lines += ["The sections are not all from the same machine or set-up; each says its own.", ""]
+    machines: dict[str, list[str]] = {}  # as JSON, and the sections from it
+    for name, result in results.items():
+        machines.setdefault(json.dumps(result.circumstances["machine"]), []).append(name)
+    for machine, sections in machines.items():
+        lines += [] if len(machines) == 1 else [f"Sections {', '.join(sections)}:", ""]
+        lines += ["| | |", "| --- | --- |", *(f"| {key} | {value} |" for key, value in json.loads(machine).items()), ""]
     return lines
 
 

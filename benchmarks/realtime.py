@@ -22,8 +22,9 @@ TITLE = "Realtime: how well the period is kept"
 METHOD = (
     "The plant node in realtime mode, in a closed loop with the controller node, at 100 Hz and at 1 kHz: how far its "
     "period is off, by its own diagnostics, and the time from an output to the effort that answers it. Beside it a bare "
-    "rclpy node with one steady timer and the fastest executor. Normal scheduling for both. In turn, fifteen times three "
-    "seconds each; the plant is inactive while the bare timer runs. What else the machine does changes within minutes, so a "
+    "rclpy node with one steady timer and the fastest executor. Normal scheduling for both. In turn, fifteen times: "
+    "three seconds of the bare timer, after one to warm up, then two to three of the plant, from its activation on; the "
+    "other is inactive meanwhile. What else the machine does changes within minutes, so a "
     "ratio is the median of those of neighbours in time."
 )
 PEERS = ("ros-jazzy-rclpy",)

@@ -17,8 +17,8 @@ METHOD = (
 )
 PEERS = ("cma", "scipy")
 NOTES = (
-    "A quarter of a run on the linear rows is the HGA's own arithmetic between evaluations, half of it before its Cholesky "
-    "factors were compiled. Its polish asks for few candidates at "
+    "On the linear rows a quarter of a run is the HGA's own arithmetic between evaluations; it was half of the run before "
+    "its Cholesky factors were compiled. Its polish asks for few candidates at "
     "a time, which costs more calls and fewer evaluations to the target than DE's whole generations. On the circuit, of "
     "which an episode has 30,000 steps, the evaluations prevail.",
 )

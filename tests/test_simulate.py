@@ -1,6 +1,7 @@
 """`tdof-npid simulate` and the parameter files that it shares with the nodes."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -31,6 +32,23 @@ def test_json_has_the_keys_of_the_contract(capsys: pytest.CaptureFixture[str]) -
 def test_single_gains_override(capsys: pytest.CaptureFixture[str]) -> None:
     report = simulated(capsys, "p1-c4", "--controller", "tdof_npid1", "--kp", "1.25", "--alpha", "0.5")
     assert (report["gains"]["kp"], report["gains"]["alpha"]) == (1.25, 0.5)  # type: ignore[index]
+
+
+def test_the_example_of_a_plant_of_one_s_own_runs(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = Path(__file__).parents[1] / "docs" / "your-own-plant.md"
+    code, parameters = re.findall(r"```(?:python|yaml)\n(.*?)```", page.read_text(), re.DOTALL)
+    (tmp_path / "my_plants").mkdir()
+    (tmp_path / "my_plants" / "pendulum.py").write_text(code)
+    file = tmp_path / "pendulum.yaml"
+    file.write_text(parameters)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    report = simulated(capsys, str(file))
+    assert 0.0 < report["setpoint"]["settling_time_s"] < 5.0  # type: ignore[index]
+    arguments = ["tune", str(file), "--controller", "tdof_npid2", "--generations", "3", "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["objective"] < report["objective"]  # type: ignore[operator]
 
 
 def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
