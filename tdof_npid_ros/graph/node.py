@@ -24,6 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
+from tdof_npid_ros.graph.ending import end_within
 from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
@@ -36,6 +37,7 @@ RECENT_QOS = signal_qos(RECENT)
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
 REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
+LEAVE_TIMEOUT = 2.0  # s until a process ends that the middleware does not let go of
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -95,8 +97,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def destroy_node(self) -> None:
         """As `Node.destroy_node`, and leave the DDS domain.
 
-        rclpy forgets a managed node's state machine, which keeps the node in the domain until C++'s static objects are
-        destroyed at the end of the process; there Fast DDS hangs now and then.
+        rclpy forgets a managed node's state machine, which would keep the node in the domain until the process has ended.
         """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
@@ -372,7 +373,7 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
     """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
     stop = Stop()
     node = None
-    status = 0
+    status = 1
     try:
         with _start_errors():
             use_fast_dds_profile()
@@ -381,12 +382,13 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
             if node.autostart:
                 _autostart(node)
         spin(node, stop)
+        status = 0
     except StartError as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
         status = 2
     finally:
         if node is not None:
-            _end(node)
+            _end(node, status)
         rclpy.try_shutdown()
         stop.ignore_further()
     sys.exit(status)
@@ -411,11 +413,12 @@ def _autostart(node: LoopNode) -> None:
         raise node.activation_error
 
 
-def _end(node: LoopNode) -> None:
+def _end(node: LoopNode, status: int) -> None:
     try:
         if node.active:
             node.deactivate()
     finally:
+        end_within(LEAVE_TIMEOUT, status)
         node.destroy_node()
 
 

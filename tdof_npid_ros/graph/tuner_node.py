@@ -19,10 +19,20 @@ from tqdm import tqdm
 from tdof_npid_ros.case import Case, controller_type, load_case, read_bounds
 from tdof_npid_ros.control.gains import PER_LANE, Gains
 from tdof_npid_ros.graph.alternate_loop import AlternateLoop
+from tdof_npid_ros.graph.ending import end_within
 from tdof_npid_ros.graph.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.graph.messages import signal_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, STOP_SIGNALS, LoopNode, executor_for, number
+from tdof_npid_ros.graph.node import (
+    ERROR,
+    LATCHED_QOS,
+    LEAVE_TIMEOUT,
+    OK,
+    STOP_SIGNALS,
+    LoopNode,
+    executor_for,
+    number,
+)
 from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -322,6 +332,7 @@ def _serve(node: TunerNode) -> int:
     spinner.join()
     if node.activated.is_set():
         node.evaluator.close()
+    end_within(LEAVE_TIMEOUT, status)
     node.destroy_node()
     return status
 

@@ -141,6 +141,25 @@ def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) 
     assert process.returncode == 0
 
 
+STUCK = """
+import ctypes, sys
+from tdof_npid_ros.graph.node import LoopNode, run_node
+
+class Stuck(LoopNode):
+    def destroy_node(self):
+        ctypes.PyDLL(None).sleep(60)  # and nobody else can run any Python
+
+run_node(lambda: Stuck("stuck"), sys.argv)
+"""
+
+
+def test_a_node_that_the_middleware_does_not_let_go_of_ends_all_the_same(graph: Any) -> None:
+    with subprocess.Popen([sys.executable, "-c", STUCK], env=graph.environment) as process:
+        graph.wait_for_nodes("/stuck")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+
+
 def test_controller_killed_and_restarted(graph: Any) -> None:
     plant = graph.start("plant", mode="lockstep", reply_timeout=0.05, retries=2)
     controller = graph.start("controller")
