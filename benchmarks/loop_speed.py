@@ -40,6 +40,7 @@ NOTES = (
     "a table and costs fewer of them than our polynomial, and next to none in a loop at rest, where C is then a quarter "
     "faster than ours. We do not take it: its last bit differs from processor to processor, so that two hosts would "
     "disagree, and it cannot be computed for many lanes at once.",
+    "With 64 lanes gcc vectorises C, too, and it is a third faster than ours. Why has not been looked into yet.",
     "Process 3 has no dead time, so that each step waits for the one before: latency bounds it, in C as here.",
 )
 

@@ -30,6 +30,7 @@ STEPS = 120  # of each episode
 RUN = {"population": 4, "generations": 10, "polish": 4, "seed": 9}
 LOSS = 5  # per cent of the packets, each way
 TIMEOUT = 100.0  # s
+ATTEMPTS = 4  # until the near loop is not through before the far one has been found: packets of discovery are lost, too
 
 
 class Hosts:
@@ -150,10 +151,14 @@ def test_two_loops_on_two_hosts_with_lost_packets_give_the_offline_result(
             except subprocess.CalledProcessError as error:
                 pytest.skip(f"packets cannot be dropped here: {error.stderr.strip()}")
         result = tmp_path / f"tuned-{lossy}.yaml"
-        log = tune_across(hosts, case, result)
-        assert read_parameters(result, "controller") == study.result.gains.as_dict()
+        for _ in range(ATTEMPTS):
+            log = tune_across(hosts, case, result)
+            hosts.stop()
+            assert read_parameters(result, "controller") == study.result.gains.as_dict()
+            if "loop /far is used" in log:
+                break
+        assert "loop /far is used" in log
         steps_per_s.append(rate(log))
-        hosts.stop()
     with capsys.disabled():
         print(
             f"\ntwo hosts: {steps_per_s[0]:.0f} steps/s without loss, {steps_per_s[1]:.0f} steps/s "
@@ -177,7 +182,6 @@ def tune_across(hosts: Hosts, case: Path, result: Path) -> str:
         assert tuner.wait(TIMEOUT) == 0, log.read_text()
     except subprocess.TimeoutExpired:
         pytest.fail(f"not tuned within {TIMEOUT:g} s: {log.read_text()}")
-    assert "loop /far is used" in log.read_text()
     return log.read_text()
 
 
