@@ -176,14 +176,13 @@ class ControllerNode(LoopEnd):
         y = self._picked("output", output.name, output.position)
         if y is None or not self.is_sound("output", y, self.controller.lanes, LARGEST_SIGNAL):
             return
+        self.waiting = None
         if episode:
             if self.plan is None or not episode.startswith(self.plan.digest):
                 self.waiting = output  # its plan is on the way
                 return
-            self.waiting = None
             setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
         else:
-            self.waiting = None
             if self.takes_output_as_setpoint:
                 self._take_setpoint(y)
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
