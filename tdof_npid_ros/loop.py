@@ -159,14 +159,14 @@ def _run_block_of(
     """Run `width` lanes through every segment of the plan; returns the lanes' rows, (_X + states, width)."""
     width = c.shape[1]
     initial = plant_at({}).initial_state
-    rows = np.zeros((_X + len(initial), width))
+    rows = _aligned_zeros(_X + len(initial), width)
     rows[:COEFFICIENTS] = c
     rows[_X:] = np.reshape(initial, (-1, 1))
     ring: np.ndarray | None = None
     for segment in signals.segments:
         sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
-            ring = np.zeros((sampled.delay + 2, width))
+            ring = _aligned_zeros(sampled.delay + 2, width)
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
         arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,
                      gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip
@@ -175,6 +175,13 @@ def _run_block_of(
         else:
             kernel_for(sampled, _run_block)(*arguments, (0,) * width)
     return rows
+
+
+def _aligned_zeros(rows: int, width: int) -> np.ndarray:
+    """Zeros, (rows, width), that begin at a cache line, as then does every row of a block: a vector lies in one line."""
+    flat = np.zeros(rows * width + VECTOR)
+    first = -flat.ctypes.data % (flat.itemsize * VECTOR) // flat.itemsize
+    return flat[first : first + rows * width].reshape(rows, width)
 
 
 @compiled
@@ -250,14 +257,13 @@ def _run_block(
     w = len(lanes)
     size = np.uint64(plant.delay + 2)
     new = np.uint64(first) % size
-    for k in range(first, last):
+    for k in range(np.uint64(first), np.uint64(last)):
         r = setpoint[k]
         d = disturbance[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        for j in range(w):
-            rows[_V_OLD * w + j] = ring[oldest * np.uint64(w) + np.uint64(j)]
-            rows[_V_DUE * w + j] = ring[due * np.uint64(w) + np.uint64(j)]
+        _copy_row(ring, oldest, rows, np.uint64(_V_OLD), lanes)
+        _copy_row(ring, due, rows, np.uint64(_V_DUE), lanes)
         for j in range(w):
             x = loaded(x, rows, _X * w + j, w)
             c = lane_coefficients(rows, j, w)
@@ -272,13 +278,19 @@ def _run_block(
             rows[_SOUND * w + j] += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
             rows[_Y * w + j] = y
             rows[_U * w + j] = u
-        for j in range(w):
-            ring[new * np.uint64(w) + np.uint64(j)] = rows[_V * w + j]
+        _copy_row(rows, np.uint64(_V), ring, new, lanes)
         if y_out.shape[0]:
-            for j in range(w):
-                y_out[k * w + j] = rows[_Y * w + j]
-                u_out[k * w + j] = rows[_U * w + j]
+            _copy_row(rows, np.uint64(_Y), y_out, k, lanes)
+            _copy_row(rows, np.uint64(_U), u_out, k, lanes)
         new = oldest
+
+
+@compiled
+def _copy_row(source: Any, row: Any, target: Any, to: Any, lanes: Any) -> Any:
+    """Copy a row of one flat array to a row of another, VECTOR numbers at once: all are read before one is written."""
+    width, one = np.uint64(len(lanes)), np.uint64(1)
+    for j in range(np.uint64(0), width, np.uint64(VECTOR)):
+        store(loaded(lanes[:VECTOR], source, row * width + j, one), target, to * width + j, one)
 
 
 @compiled
