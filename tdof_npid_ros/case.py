@@ -122,9 +122,9 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        y, setpoint = self._response("setpoint", gains)
-        if setpoint == 0.0:
-            raise PlanError(f"{self.name}, episode 'setpoint': the setpoint stays 0, so there is no step to measure")
+        y, setpoint, disturbance = self._response("setpoint", gains)
+        if setpoint == 0.0 or disturbance != 0.0:
+            raise _no_single_step(self, "setpoint", f"the setpoint is {setpoint:g} and the disturbance {disturbance:g}")
         return setpoint_metrics(y, 0.0, setpoint, self.sample_period)
 
     def disturbance_response(self, gains: Gains | None = None) -> DisturbanceMetrics:
@@ -133,22 +133,29 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        y, setpoint = self._response("disturbance", gains)
+        y, setpoint, _ = self._response("disturbance", gains)
+        if not np.isclose(setpoint, y[0]):
+            raise _no_single_step(self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}")
         return disturbance_metrics(y, setpoint, self.sample_period)
 
-    def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float]:
-        """The output (steps + 1,) of an episode of one lane, and the setpoint that it holds from its start on."""
+    def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float, float]:
+        """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start on."""
         lanes = (gains or self.gains).lanes
         if lanes > 1:
             raise GainsError(f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each")
         output = self.simulate(episode, gains).output[:, 0]
-        setpoint = self.signals[episode].setpoint
-        if np.any(setpoint != setpoint[0]):
-            raise PlanError(
-                f"{self.name}, episode {episode!r}: the setpoint changes after 0 s, but the metrics are of one step at 0 s; "
-                "record it and measure every step with 'tdof-npid analyze'"
-            )
-        return output, float(setpoint[0])
+        signals = self.signals[episode]
+        for name, values in (("setpoint", signals.setpoint), ("disturbance", signals.disturbance)):
+            if np.any(values != values[0]):
+                raise _no_single_step(self, episode, f"the {name} changes after 0 s")
+        return output, float(signals.setpoint[0]), float(signals.disturbance[0])
+
+
+def _no_single_step(case: Case, episode: str, why: str) -> PlanError:
+    return PlanError(
+        f"{case.name}, episode {episode!r}: {why}, but the metrics are of one step of the {episode} at 0 s; "
+        "record it and measure every step with 'tdof-npid analyze'"
+    )
 
 
 def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
@@ -210,7 +217,7 @@ def find_parameter_file(name: str | Path) -> Path:
         ParameterFileError: there is none.
     """
     path = Path(name)
-    if path.suffix in (".yaml", ".yml") or path.exists():
+    if path.suffix in (".yaml", ".yml") or path.is_file():
         return path
     folder = config_folder()
     found = folder / f"{name}.yaml"

@@ -27,6 +27,16 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     return shared | own
 
 
+def check_only_gains(path: Path) -> None:
+    """Make sure that a file, if it is there, holds gains as `write_parameters` writes them, and nothing else to lose.
+
+    Raises:
+        ParameterFileError: it holds something else.
+    """
+    if path.exists() and set(_load(path)) != {"/**/controller"}:
+        raise ParameterFileError(f"{path} holds more than a controller's gains, which would be lost: give another file")
+
+
 def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:
     """Write a ROS parameter file: parameters by node name, for nodes in any namespace.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import config_folder, load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.paper.tables import CASES
@@ -56,6 +56,27 @@ def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tm
     write_parameters(file, {"controller": {"kp": 1.5, "ki": 0.25, "kd": 2.0}})
     report = simulated(capsys, "p1-c4", "--controller", "pid", "--gains", str(file))
     assert report["gains"]["kp"] == 1.5  # type: ignore[index]
+    write_parameters(file, {"controller": {"type": "pid", "kp": 1.5}})
+    assert simulated(capsys, "p1-c4", "--gains", str(file))["controller"] == "pid"
+    assert simulated(capsys, "p1-c4", "--gains", str(file), "--controller", "npid")["controller"] == "npid"
+    write_parameters(file, {"plant": {"gain": 2.0}})
+    assert main(["simulate", "p1-c4", "--gains", str(file)]) == 2
+    assert "no parameters of a controller in it" in capsys.readouterr().err
+
+
+def test_a_folder_does_not_hide_a_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p1-c4").mkdir()
+    assert simulated(capsys, "p1-c4")["case"] == "p1-c4"
+
+
+def test_a_dead_time_beyond_memory_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "slow.yaml"
+    file.write_text((config_folder() / "p1-c4.yaml").read_text().replace("dead_time: 4.0", "dead_time: 1.0e+9"))
+    assert main(["simulate", str(file)]) == 2
+    assert "dead_time is 1e+09 s" in capsys.readouterr().err
 
 
 def status_of(arguments: list[str]) -> int:
@@ -144,7 +165,7 @@ LOOP = (
     "/**/plant: {{ros__parameters: {{model: first_order, dead_time: 0.0}}}}\n"
     "/**/controller: {{ros__parameters: {{type: pid, kp: {kp}, ki: 1.0}}}}\n"
     "/**/scenario: {{ros__parameters: {{episodes: [{episodes}], plan: "
-    '{{setpoint: [{setpoint}, "30 end"], disturbance: ["0 disturbance 1", "30 end"]}}}}}}\n'
+    '{{setpoint: [{setpoint}, "30 end"], disturbance: [{disturbance}, "30 end"]}}}}}}\n'
 )
 
 
@@ -154,15 +175,20 @@ LOOP = (
         ({"kp": "[1.0, 2.0]"}, "2 lanes"),
         ({"episodes": ""}, "no episode 'setpoint'"),
         ({"episodes": "setpoint"}, "no episode 'disturbance'"),
-        ({"setpoint": '"0 setpoint 0"'}, "no step to measure"),
-        ({"setpoint": '"5 setpoint 1"'}, "changes after 0 s"),
-        ({"setpoint": '"0 setpoint 1", "30 setpoint 2"'}, "changes after 0 s"),
+        ({"setpoint": '"0 setpoint 0"'}, "the setpoint is 0 and the disturbance 0"),
+        ({"setpoint": '"0 setpoint 1", "0 disturbance 2"'}, "the setpoint is 1 and the disturbance 2"),
+        ({"setpoint": '"5 setpoint 1"'}, "the setpoint changes after 0 s"),
+        ({"setpoint": '"0 setpoint 1", "30 setpoint 2"'}, "the setpoint changes after 0 s"),
+        ({"setpoint": '"0 setpoint 1", "9 disturbance 1"'}, "the disturbance changes after 0 s"),
+        ({"disturbance": '"9 disturbance 1"'}, "the disturbance changes after 0 s"),
+        ({"disturbance": '"0 setpoint 1", "0 disturbance 1"'}, "the setpoint is 1, but the output begins at 0"),
     ],
 )
 def test_metrics_are_told_of_a_single_step_at_the_start_only(
     changes: dict[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    values = {"kp": "2.0", "episodes": "setpoint, disturbance", "setpoint": '"0 setpoint 1"'}
+    values = {"kp": "2.0", "episodes": "setpoint, disturbance"}
+    values |= {"setpoint": '"0 setpoint 1"', "disturbance": '"0 disturbance 1"'}
     file = tmp_path / "loop.yaml"
     file.write_text(LOOP.format(**(values | changes)))
     assert main(["simulate", str(file)]) == 2

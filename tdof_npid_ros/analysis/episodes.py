@@ -18,6 +18,8 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.stamps import RESTART_NS
 from tdof_npid_ros.scenario import Plan, episode_named, parse_plan
 
+LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one episode; a robot's first message may be stamped 0
+MOST_SAMPLES = 10_000_000  # of an episode without a plan, as plans have at most
 UNPLANNED = "recording"  # the name of an episode without a plan
 
 
@@ -69,16 +71,14 @@ class Episode:
         return ", ".join(dict.fromkeys(gains.type for gains in self.gains))
 
 
-def read_episodes_of(path: str | Path) -> list[Episode]:
-    """The episodes in a bag, in the order in which they began.
+def episodes_in(reader: BagReader, path: str | Path) -> list[Episode]:
+    """The episodes in a bag, in the order in which they began; `path` is for messages.
 
     Raises:
         AnalysisError: there is no output in it, or none of two samples.
-        BagError: no bag, or it is damaged.
+        BagError: it is damaged.
     """
-    with BagReader(path) as reader:
-        loops = read_loops(reader, str(path))
-    found = [episode for loop in loops for episode in _episodes(loop)]
+    found = [episode for loop in read_loops(reader, str(path)) for episode in _episodes(loop)]
     if not found:
         raise AnalysisError(f"{path}: no episode of at least two outputs in it: record longer")
     return sorted(found, key=lambda episode: episode.start_ns)
@@ -113,12 +113,12 @@ def _episodes(loop: Loop) -> Iterator[Episode]:
 
 
 def _stretches(signal: Signal) -> list[slice]:
-    """Stretches of one episode each: the frame_id's episode stays the same and no stamp goes back to a start."""
+    """Stretches of one episode each: the frame_id's episode stays the same, no stamp goes back to a start or far ahead."""
     if not len(signal):
         return []
     stamps = signal.stamp_ns
     back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > RESTART_NS))
-    starts = {0, *(np.flatnonzero(back) + 1).tolist()}
+    starts = {0, *(np.flatnonzero(back | (stamps[1:] - stamps[:-1] > LONGEST_GAP_NS)) + 1).tolist()}
     runs = signal.runs()
     for before, run in zip(runs, runs[1:], strict=False):
         if _episode_of(signal, before) != _episode_of(signal, run):
@@ -160,7 +160,7 @@ def _episode(
     period_ns = int(np.median(np.diff(stamps)))
     digest, _, number = frame.partition("/")
     plan = loop.plans.get(digest)
-    grid = _grid(stamps, period_ns, plan)
+    grid = _grid(stamps, period_ns, plan, loop.bag)
     hold = not frame
     output = _on_grid(grid, stamps, rows, hold)
     setpoint, effort = np.full((2, *output.shape), np.nan)
@@ -221,10 +221,15 @@ def _widened(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
     return np.repeat(rows, lanes, axis=1) if rows.shape[1] == 1 else np.full((len(rows), lanes), np.nan)
 
 
-def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None) -> np.ndarray:
+def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np.ndarray:
     """Stamps k·h, of the whole plan or from the first output to the last."""
     if plan is not None:
         return np.arange(plan.steps(period_ns) + 1, dtype=np.int64) * period_ns
+    if (stamps[-1] - stamps[0]) // period_ns > MOST_SAMPLES:
+        raise AnalysisError(
+            f"{bag}: outputs stamped from {stamps[0] / 1e9:.9g} to {stamps[-1] / 1e9:.9g} s, mostly {period_ns} ns apart, "
+            f"are more than {MOST_SAMPLES:,} sample periods: analyse a shorter or more regular recording"
+        )
     return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)
 
 

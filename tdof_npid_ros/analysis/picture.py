@@ -41,7 +41,8 @@ def draw(episodes: Sequence[Named], path: Path, legend: Mapping[str, str]) -> No
     Raises:
         AnalysisError: the file cannot be written.
     """
-    groups = list(grouped(episodes).items())[:MOST_COLUMNS]
+    kinds = list(grouped(episodes).items())
+    groups = kinds[:MOST_COLUMNS]
     bags = bag_names(episode.bag for _, episode in episodes)
     figure = Figure(figsize=(1.5 + 5.5 * len(groups), 6.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -68,8 +69,10 @@ def draw(episodes: Sequence[Named], path: Path, legend: Mapping[str, str]) -> No
             axis.grid(alpha=0.3)
     axes[0][0].set_ylabel("setpoint r, output y")
     axes[1][0].set_ylabel("control effort u, disturbance d")
+    if len(kinds) > len(groups):
+        figure.supxlabel(f"… and {len(kinds) - len(groups)} more kinds of episodes: --html shows all", fontsize=9)
     try:
-        figure.savefig(path, dpi=120)
+        figure.savefig(path, dpi=120, format=path.suffix[1:] or "png")
     except (OSError, ValueError) as error:
         raise AnalysisError(f"{path} cannot be written: {error}") from None
 
@@ -77,7 +80,7 @@ def draw(episodes: Sequence[Named], path: Path, legend: Mapping[str, str]) -> No
 def _draw_driving(axis: Axes, time: np.ndarray, values: np.ndarray, name: str, drawn: set[bytes]) -> None:
     """Draw a setpoint or disturbance, dashed, unless it is there already, or a disturbance that is none."""
     content = values.tobytes()
-    if content in drawn or (name == "disturbance" and not values.any()):
+    if content in drawn or np.isnan(values).all() or (name == "disturbance" and not values.any()):
         return
     drawn.add(content)
     axis.plot(time, values, "--", color="0.4", lw=1, label=name, drawstyle="steps-post")

@@ -134,6 +134,7 @@ def _output_topics(reader: BagReader, bag: str) -> list[str]:
         raise AnalysisError(
             f"{bag}: no output in it, that is no topic of type {JOINT_STATE} but "
             f"{', '.join(_OTHER_SIGNALS)}: its topics are {', '.join(sorted(reader.topics)) or 'none'}"
+            + "".join(f"; missing: {line}" for line in reader.missing)
         )
     return others
 

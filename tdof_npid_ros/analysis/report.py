@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.analysis import page, picture
-from tdof_npid_ros.analysis.episodes import Episode, bag_names, read_episodes_of
+from tdof_npid_ros.analysis.episodes import Episode, bag_names, episodes_in
 from tdof_npid_ros.analysis.responses import Deviation, EffortUse, Response, deviation, effort_use, responses
+from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
 
 LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
@@ -59,9 +60,15 @@ class EpisodeReport:
 
 @dataclass(frozen=True)
 class Report:
-    """What `analyze` found: the episodes of all bags, in the order of the bags and of time."""
+    """What `analyze` found.
+
+    Attributes:
+        episodes: of all bags, in the order of the bags and of time.
+        missing: what bags that were cut off lack, a line for each thing.
+    """
 
     episodes: tuple[EpisodeReport, ...]
+    missing: tuple[str, ...] = ()
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per response, by the names of `COLUMNS`; None where there is no such number."""
@@ -103,16 +110,18 @@ class Report:
         for report in self.episodes:
             name = title(report.episode)
             for response in report.responses[0]:
-                if response.reason and response.kind != "tracking":
+                if response.reason and (response.kind != "tracking" or response.iae is None):
                     causes.setdefault(f"response to {response.kind}: {response.reason}", []).append(name)
             if report.deviation.reason and report.episode.plan is not None:
                 causes.setdefault(f"not compared with the simulation: {report.deviation.reason}", []).append(name)
-        return [f"{', '.join(dict.fromkeys(names))}: {cause}" for cause, names in causes.items()]
+        found = [f"{', '.join(dict.fromkeys(names))}: {cause}" for cause, names in causes.items()]
+        return [*found, *(f"missing: {line}" for line in self.missing)]
 
     def as_json(self) -> dict[str, Any]:
         """The whole report as a JSON object; limits that are infinite become null."""
         changes = iter([row["iae_change_percent"] for row in self.rows()])
-        document: dict[str, Any] = _finite({"episodes": [_as_json(report, changes) for report in self.episodes]})
+        episodes = [_as_json(report, changes) for report in self.episodes]
+        document: dict[str, Any] = _finite({"episodes": episodes, "missing": list(self.missing)})
         return document
 
     def as_csv(self) -> str:
@@ -151,7 +160,13 @@ def analyze(paths: Iterable[str | Path]) -> Report:
         AnalysisError: there is no output in a bag.
         BagError: no bag, or it is damaged.
     """
-    return Report(tuple(_report(episode) for path in paths for episode in read_episodes_of(path)))
+    episodes: list[EpisodeReport] = []
+    missing: list[str] = []
+    for path in paths:
+        with BagReader(path) as reader:
+            episodes += map(_report, episodes_in(reader, path))
+            missing += reader.missing
+    return Report(tuple(episodes), tuple(missing))
 
 
 def title(episode: Episode) -> str:

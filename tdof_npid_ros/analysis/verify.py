@@ -71,10 +71,12 @@ class Verification:
     Attributes:
         equal, different: answers that were computed again.
         unverifiable: answers that could not be, by reason.
+        missing: what a bag that was cut off lacks, a line for each thing.
         first: the first difference.
     """
 
     bag: str
+    missing: tuple[str, ...] = ()
     equal: int = 0
     different: int = 0
     unverifiable: Counter[str] = field(default_factory=Counter)
@@ -91,6 +93,7 @@ class Verification:
         found += [f"  {count} not verifiable: {reason}" for reason, count in self.unverifiable.items()]
         if not self.equal and not self.different:
             found.append("  nothing was verified")
+        found += [f"  missing: {line}" for line in self.missing]
         return [*found, *(self.first.lines() if self.first else [])]
 
 
@@ -103,9 +106,10 @@ def verify(path: str | Path) -> Verification:
     """
     with BagReader(path) as reader:
         loops = [loop for loop in read_loops(reader, str(path)) if loop.control_effort is not None]
+        missing = tuple(reader.missing)
     if not loops:
         raise AnalysisError(f"{path}: no control efforts in it to verify: record the controller's namespace")
-    account = Verification(str(path))
+    account = Verification(str(path), missing)
     for loop in loops:
         _Replay(loop, account).run()
     return account
@@ -256,8 +260,10 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
     assert answers is not None
     outputs = loop.output
     places: dict[tuple[str, int], list[int]] = defaultdict(list)  # of the outputs, latest first
-    for i in range(len(outputs) - 1, -1, -1):
-        places[episode_named(str(outputs.frame_id[i])), int(outputs.stamp_ns[i])].append(i)
+    for run in reversed(outputs.runs()):
+        episode = episode_named(str(outputs.frame_id[run.start]))
+        for i in reversed(range(run.start, run.stop)):
+            places[episode, int(outputs.stamp_ns[i])].append(i)
     latest = before = 0
     for step, (frame, stamp, sequence) in enumerate(
         zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
-from tdof_npid_ros.tuning.output_file import check_writable
+from tdof_npid_ros.output_file import check_outputs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,9 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of every episode and write what was asked for."""
-    for path in (arguments.png, arguments.html, arguments.csv):
-        if path is not None:
-            check_writable(path)
+    check_outputs([path for path in (arguments.png, arguments.html, arguments.csv) if path], _files(arguments.bags))
     report = analyze(arguments.bags)
     written = []
     if arguments.png:
@@ -41,3 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     for path in written:
         print(f"written: {path}")
     return 0
+
+
+def _files(bags: list[str]) -> list[Path]:
+    """The bags, and what lies in those that are folders."""
+    return [file for bag in map(Path, bags) for file in (bag, *(bag.iterdir() if bag.is_dir() else ()))]

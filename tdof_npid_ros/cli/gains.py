@@ -31,17 +31,22 @@ def chosen_gains(case: Case, arguments: argparse.Namespace) -> Gains:
     Raises:
         ParameterFileError, GainsError: there are no such gains, or they are not valid.
     """
-    kind = controller_type(arguments.controller) if arguments.controller else case.gains.type
     overrides = {name: getattr(arguments, name) for name in PER_LANE if getattr(arguments, name) is not None}
-    return gains_by_source(case, kind, arguments.gains).with_values(**overrides)
+    return gains_by_source(case, arguments.controller, arguments.gains).with_values(**overrides)
 
 
-def gains_by_source(case: Case, kind: str, source: str | None) -> Gains:
-    """Gains of a controller type: `published`, `tuned`, from a parameter file, or (None) published or else the case's."""
-    type_ = controller_type(kind)
+def gains_by_source(case: Case, kind: str | None, source: str | None) -> Gains:
+    """Gains of a controller type: `published`, `tuned`, from a parameter file, or (None) published or else the case's.
+
+    Without a type, it is the file's or else the case's.
+    """
     if source not in (None, "published", "tuned"):
         values = read_parameters(Path(source), "controller")
+        if not values.keys() & case.gains.as_dict().keys():
+            raise ParameterFileError(f"{source}: no parameters of a controller in it")
+        type_ = controller_type(kind or values.get("type", case.gains.type))
         return gains_from_mapping({**case.gains.as_dict(), **values, "type": type_})
+    type_ = controller_type(kind or case.gains.type)
     table = {"published": published, "tuned": tuned}[source or "published"]
     row = table(case.name, type_)
     if row is None and source is None:

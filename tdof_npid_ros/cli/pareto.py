@@ -13,10 +13,10 @@ from tqdm import tqdm
 
 from tdof_npid_ros.case import controller_type
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.output_file import check_writable
 from tdof_npid_ros.tuning.pareto import GENERATIONS, RATIOS, Front, check_installed, foptd_case, pareto_front
 
 SUBCOMMAND = "pareto"

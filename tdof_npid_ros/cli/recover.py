@@ -18,8 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the new bag and say what is missing; 0 also when something is."""
-    bag = arguments.bag
-    report = recover(bag, arguments.destination or bag.with_name(f"{bag.stem}-recovered"))
+    bag = arguments.bag.resolve()
+    name = bag.name if bag.is_dir() else bag.stem
+    report = recover(arguments.bag, arguments.destination or bag.with_name(f"{name}-recovered"))
     if arguments.json:
         print(json.dumps({**asdict(report), "whole": report.whole}, default=str))
     else:

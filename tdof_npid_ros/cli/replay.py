@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 
 from tdof_npid_ros.graph.replay_node import replay
 
@@ -27,7 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Replay to the end, or to Ctrl-C."""
     parameters = {name: getattr(arguments, name) for name in ("bag", "rate", "start", "loop", "clock", "compare")}
-    ros = ["--ros-args", "-r", f"__ns:={arguments.namespace}"]
+    namespace = "/" + arguments.namespace.strip("/")
+    if not re.fullmatch(r"/|(/[A-Za-z_]\w*)+", namespace, re.ASCII):
+        raise ValueError(f"--namespace {arguments.namespace!r}: it must be names of letters, digits and _ between slashes")
+    ros = ["--ros-args", "-r", f"__ns:={namespace}"]
     for name, value in parameters.items():
         ros += ["-p", f"{name}:={json.dumps(value)}"]
     status, comparison = replay(["replay", *ros])

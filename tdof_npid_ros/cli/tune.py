@@ -20,11 +20,11 @@ from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import response_report
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
-from tdof_npid_ros.parameter_file import write_parameters
+from tdof_npid_ros.output_file import check_outputs
+from tdof_npid_ros.parameter_file import check_only_gains, write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
-from tdof_npid_ros.tuning.output_file import check_writable
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study, TuningResult
 
@@ -105,11 +105,9 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     if arguments.resume and not arguments.checkpoint:
         raise TuningError("--resume needs --checkpoint FILE: what to go on from")
     written = [path for path in (arguments.checkpoint, arguments.out, arguments.plot) if path]
-    taken = [find_parameter_file(arguments.case), *written]
-    if len({path.resolve() for path in taken}) < len(taken):
-        raise TuningError("the case, --checkpoint, --out and --plot must be different files")
-    for path in written:
-        check_writable(path)
+    check_outputs(written, [find_parameter_file(arguments.case)])
+    if arguments.out:
+        check_only_gains(arguments.out)
 
 
 @contextmanager

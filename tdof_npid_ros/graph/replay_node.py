@@ -25,6 +25,7 @@ from tdof_npid_ros.signals import SECOND, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
+CDR_ENCODINGS = ("ros2msg", "ros2idl", "")  # how definitions of messages in CDR are written; bags may lack them
 FOR_CONTROLLER = ("scenario_plan", "setpoint")  # what a controller is given, besides the output
 MATCH_TIMEOUT = 10.0  # s until subscribers must have come, where an answer is needed
 REPLY_TIMEOUT = 0.5  # s until an output is published again
@@ -96,8 +97,11 @@ class ReplayNode(LoopNode):
 
     def _publisher(self, topic: str) -> Publisher | None:
         qos = LATCHED_QOS if self._is_latched(topic) else SIGNAL_QOS
+        info = self.reader.topics[topic]
         try:
-            return self.create_publisher(message_class(self.reader.topics[topic].type), self._relative(topic), qos)
+            if info.encoding not in CDR_ENCODINGS:
+                raise ValueError(f"it is in {info.encoding}, not CDR")
+            return self.create_publisher(message_class(info.type), self._relative(topic), qos)
         except ValueError as error:
             self.get_logger().warning(f"{topic} is not replayed: {error}")
             return None
@@ -218,7 +222,7 @@ def replay(arguments: list[str]) -> tuple[int, Comparison]:
     except SystemExit as end:
         status = end.code or 0
     comparison = nodes[0].comparison if nodes else Comparison()
-    if status == 0 and nodes and nodes[0].compare and not comparison.sound:
+    if status == 0 and nodes and (comparison.failure or (nodes[0].compare and not comparison.sound)):
         status = 1
     return int(status), comparison
 

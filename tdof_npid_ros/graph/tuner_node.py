@@ -33,10 +33,10 @@ from tdof_npid_ros.graph.node import (
     executor_for,
     number,
 )
-from tdof_npid_ros.parameter_file import ParameterFileError, write_parameters
+from tdof_npid_ros.output_file import check_writable
+from tdof_npid_ros.parameter_file import ParameterFileError, check_only_gains, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
-from tdof_npid_ros.tuning.output_file import check_writable
 from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
@@ -93,6 +93,7 @@ class TunerNode(LoopNode):
         self.stay = self.declare_value("stay", False, "stay on the graph when done, instead of ending", fixed=True)
         if self.result_file is not None:
             check_writable(self.result_file)
+            check_only_gains(self.result_file)
         self.study = Study(self.problem, checkpoint, bool(resume))
         self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"
 

@@ -15,6 +15,8 @@ from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
 
+LONGEST_DEAD_TIME = 1_000_000  # samples: what a lane's efforts on their way take of memory is 8 MB
+
 _PRECISION = threading.Lock()  # mpmath's precision belongs to the whole process
 
 
@@ -79,6 +81,10 @@ def _sample(
     and v[k-delay] for the rest: both contributions are blocks of exp([[A, B], [0, 0]] t).
     """
     delay, late_ns = divmod(dead_time_ns, period_ns)
+    if delay > LONGEST_DEAD_TIME:
+        raise PlantError(
+            f"dead_time is {dead_time_ns / 1e9:g} s, {delay:,} samples: it must not be more than {LONGEST_DEAD_TIME:,}"
+        )
     with _PRECISION, mpmath.workdps(DIGITS):
         period, late = mpmath.mpf(period_ns) / 10**9, mpmath.mpf(late_ns) / 10**9
         a, b = _observable_form(numerator, denominator)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from tdof_npid_ros.case import Bounds, Case
-from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains
+from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains, GainsError
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -18,6 +19,9 @@ EPISODES = ("setpoint", "disturbance")
 
 POPULATION, GENERATIONS = 40, 200
 """By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""
+
+LARGEST_WEIGHT = 1e100
+"""So that the objective (10) stays finite."""
 
 POLISH = 6
 """By default: candidates in each step of the HGA's polish, for the fewest evaluations."""
@@ -52,8 +56,8 @@ class TuningProblem:
     polish: int = POLISH
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.weight < math.inf:
-            raise TuningError(f"weight is {self.weight}: it must be finite and not below 0")
+        if not 0.0 <= self.weight <= LARGEST_WEIGHT:
+            raise TuningError(f"weight is {self.weight}: it must be a number from 0 to {LARGEST_WEIGHT:g}")
         if self.extra not in ((), ("sigma",)) or (self.extra and self.controller == "pid"):
             raise TuningError(f"{', '.join(self.extra)} cannot be freed for {self.controller}: only sigma, not for pid")
         missing = [episode for episode in EPISODES if episode not in self.case.episodes]
@@ -76,6 +80,11 @@ class TuningProblem:
             )
         if "sigma" in bounds and bounds["sigma"][0] <= 0:
             raise TuningError(f"{self.case.name}: bounds sigma {list(bounds['sigma'])}: it must stay above 0")
+        for corner in zip(*self.bounds, strict=True):
+            try:
+                self.gains(np.array(corner))
+            except GainsError as error:
+                raise TuningError(f"{self.case.name}: its bounds hold gains that no controller takes: {error}") from None
 
     @property
     def names(self) -> tuple[str, ...]:

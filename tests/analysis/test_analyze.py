@@ -3,6 +3,7 @@
 import base64
 import csv
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_bags import JOINT_STATE, STEP_NS, TYPES, LoopBag, joint_state
+from loop_bags import JOINT_STATE, START_NS, STEP_NS, TYPES, LoopBag, joint_state
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
@@ -183,6 +184,47 @@ def test_a_robot_without_plan_or_controller(tmp_path) -> None:
     (report,) = analyze([tmp_path / "bag"]).episodes
     assert (report.episode.name, report.episode.lanes, len(report.episode.time)) == ("recording", 2, 100)
     assert "recording #1" in analyze([tmp_path / "bag"]).table()
+
+
+def test_a_first_stamp_of_0_is_no_part_of_what_follows(tmp_path) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        for stamp in (0, *range(START_NS, START_NS + 10**9, 10**7)):
+            writer.write("joint_states", JOINT_STATE, joint_state(stamp, "base_link", [1.0]))
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert len(report.episode.time) == 100
+    assert "recording #2: response to tracking: the setpoint is not in the bag" in analyze([tmp_path / "bag"]).table()
+
+
+def test_stamps_that_fit_no_grid_are_refused(tmp_path) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        for stamp in (1, 2, 3, 10**9):
+            writer.write("joint_states", JOINT_STATE, joint_state(stamp, "base_link", [1.0]))
+    with pytest.raises(AnalysisError, match="more than 10,000,000 sample periods"):
+        analyze([tmp_path / "bag"])
+
+
+def test_a_bag_that_was_cut_off_is_said_to_be(bag, capsys) -> None:
+    file = bag / "bag_0.mcap"
+    os.truncate(file, file.stat().st_size - 100)
+    assert main(["analyze", str(bag)]) == 0
+    assert f"missing: {file}: the index and summary: the recording was never finished" in capsys.readouterr().out
+    assert main(["analyze", str(bag), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["missing"]) == 1
+    assert main(["verify", str(bag)]) == 0
+    assert "  missing: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["--csv", "{bag}/bag_0.mcap"], ["--csv", "{bag}.txt", "--html", "{bag}.txt"]])
+def test_nothing_is_written_over(bag, options, capsys) -> None:
+    before = (bag / "bag_0.mcap").read_bytes()
+    assert main(["analyze", str(bag), *(option.format(bag=bag) for option in options)]) == 2
+    assert "must be different files" in capsys.readouterr().err
+    assert (bag / "bag_0.mcap").read_bytes() == before
+
+
+def test_a_picture_is_written_where_it_was_asked_for(bag, tmp_path) -> None:
+    analyze([bag]).picture(tmp_path / "picture")
+    assert (tmp_path / "picture").read_bytes().startswith(PNG)
 
 
 def test_a_realtime_loop_takes_setpoint_and_disturbance_from_their_topics(tmp_path, case) -> None:

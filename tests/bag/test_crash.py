@@ -16,6 +16,7 @@ from tdof_npid_ros.bag.mcap_file import McapFile
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.bag.recover import recover
 from tdof_npid_ros.bag.schema import definition
+from tdof_npid_ros.cli import main
 
 KILLS = budget("TDOF_NPID_KILLS", 20)  # issue 5 asks for 200 once
 TRUNCATIONS = -(-budget("TDOF_NPID_TRUNCATIONS", 300) // 3)  # for each compression; issue 5 asks for 2000 in all once
@@ -50,6 +51,7 @@ def _seconds_lost(folder, started_ns, killed_ns) -> float:
     return (killed_ns - max(last_ns, started_ns)) / SECOND_NS
 
 
+@pytest.mark.timeout(120 + 2 * KILLS)
 def test_killed_recorders_leave_good_bags(tmp_path) -> None:
     chance = random.Random(1)
     worst = 0.0
@@ -148,6 +150,17 @@ def test_recovered_bag_is_whole_and_accounts_for_the_rest(tmp_path) -> None:
         assert dict(reader.metadata)["recovered"]["report"] == "\n".join(report.lines())
     with pytest.raises(BagError, match=r"exists already"):
         recover(tmp_path / "bag", tmp_path / "whole")
+
+
+def test_recover_names_the_new_bag_after_the_old(tmp_path, monkeypatch) -> None:
+    for name in ("run-c0.5", "run-c0.7"):
+        write_bag(tmp_path / name, 10)
+        assert main(["recover", str(tmp_path / name)]) == 0
+        assert (tmp_path / f"{name}-recovered").is_dir()
+    write_bag(tmp_path / "here", 10)
+    monkeypatch.chdir(tmp_path / "here")
+    assert main(["recover", "."]) == 0
+    assert (tmp_path / "here-recovered").is_dir()
 
 
 def test_recover_leaves_out_a_damaged_chunk(tmp_path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, Writer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "analysis"))
 from loop_bags import JOINT_STATE, STEP_NS, LoopBag, joint_state
@@ -83,6 +84,19 @@ def test_rate_and_loop(graph: Any, bag: Path) -> None:
     replay.stop()
 
 
+def written_by_mcap(folder: Path, encoding: str, schema_encoding: str, messages: list[bytes]) -> Path:
+    """A file by the mcap package, without a checksum over all data."""
+    file = folder / "foreign.mcap"
+    writer = Writer(str(file), compression=CompressionType.NONE)
+    writer.start()
+    schema = writer.register_schema(JOINT_STATE, schema_encoding, b"")
+    channel = writer.register_channel("/output", encoding, schema)
+    for time_ns, data in enumerate(messages, start=1):
+        writer.add_message(channel, log_time=time_ns, publish_time=time_ns, data=data)
+    writer.finish()
+    return file
+
+
 def test_a_start_after_the_end_is_refused(graph: Any, bag: Path) -> None:
     replay = graph.start("replay", bag=str(bag), start=10.0)
     wait_for_end(graph, replay, 2)
@@ -99,6 +113,21 @@ def test_a_type_that_is_not_installed_is_left_out(graph: Any, bag: Path, tmp_pat
     replay = graph.start("replay", bag=str(tmp_path / "more"))
     wait_for_end(graph, replay, 0)
     assert "/gripper is not replayed: the message type robot_msgs/msg/Grip is not installed" in replay.log
+
+
+def test_what_is_no_cdr_is_left_out(graph: Any, tmp_path: Path) -> None:
+    file = written_by_mcap(tmp_path, "json", "jsonschema", [b"{}"])
+    replay = graph.start("replay", bag=str(file))
+    wait_for_end(graph, replay, 0)
+    assert "/output is not replayed: it is in json, not CDR" in replay.log
+
+
+def test_a_replay_that_broke_off_is_no_success(graph: Any, tmp_path: Path) -> None:
+    file = written_by_mcap(tmp_path, "cdr", "ros2msg", [joint_state(k, "base_link") for k in range(10)])
+    file.write_bytes(file.read_bytes().replace(b"base_link", b"BASE_LINK", 1))
+    replay = graph.start("replay", bag=str(file))
+    wait_for_end(graph, replay, 1)
+    assert "checksum" in replay.log
 
 
 def test_a_robots_joint_states_are_given_to_the_controller(graph: Any, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import yaml
 
 from tdof_npid_ros.case import config_folder, load_case
 from tdof_npid_ros.cli import main
+from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning.study import tune_case
 
 QUICK = ["p3-c1", "--population", "10", "--generations", "5", "--seed", "2"]
@@ -114,6 +115,7 @@ def test_people_see_the_progress_and_the_optimum(capsys: pytest.CaptureFixture[s
         (["p3-c1", "--controller", "pid", "--algorithm", "luck"], "algorithm 'luck' is unknown"),
         (["p3-c1", "--controller", "pid", "--free", "sigma"], "sigma cannot be freed for pid"),
         (["p3-c1", "--controller", "pid", "--weight", "-1"], "weight is -1.0"),
+        (["p3-c1", "--controller", "pid", "--weight", "1e300"], "weight is 1e+300"),
         (["p3-c1", "--controller", "pid", "--seed", "-1"], "seed -1"),
         (["p3-c1", "--controller", "pid", "--population", "0"], "population 0"),
         (["p3-c1", "--controller", "pid", "--generations", "0"], "generations 0"),
@@ -128,6 +130,23 @@ def test_people_see_the_progress_and_the_optimum(capsys: pytest.CaptureFixture[s
 )
 def test_bad_input_is_refused_in_one_line(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert told in refused(capsys, *arguments)
+
+
+def test_gains_replace_nothing_but_gains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "gains.yaml"
+    for _ in range(2):
+        assert main(["tune", *QUICK, "--controller", "pid", "--out", str(out)]) == 0
+    capsys.readouterr()
+    write_parameters(out, {"controller": {"kp": 1.0}, "plant": {"gain": 2.0}})
+    before = out.read_bytes()
+    assert "holds more than a controller's gains" in refused(capsys, *QUICK, "--controller", "pid", "--out", str(out))
+    assert out.read_bytes() == before
+
+
+def test_bounds_that_no_controller_takes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = tmp_path / "wide.yaml"
+    case.write_text((config_folder() / "p3-c1.yaml").read_text().replace("kp: [", "kp: [1.0, 1.0e+60]  # ["))
+    assert "its bounds hold gains that no controller takes: kp" in refused(capsys, str(case), "--controller", "pid")
 
 
 def test_without_cma_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
