@@ -191,6 +191,14 @@ def load_case(name: str | Path) -> Case:
     plant, controller, scenario, tuner = (
         read_parameters(path, n) for n in ("plant", "controller", "scenario", "tuner")
     )
+    periods = {
+        node: values["sample_period"]
+        for node, values in (("plant", plant), ("controller", controller), ("scenario", scenario))
+        if "sample_period" in values
+    }
+    if len(set(periods.values())) > 1:
+        told = " and ".join(f"{period} in {node}" for node, period in periods.items())
+        raise ParameterFileError(f"{path}: sample_period is {told}: the nodes of a loop need the same, give it to /**")
     try:
         case = Case(
             name=path.stem,

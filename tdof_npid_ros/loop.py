@@ -21,7 +21,7 @@ from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of
 from tdof_npid_ros.control.operation import Operation
-from tdof_npid_ros.plants.kernels import kernel_for, plant_input, plant_output
+from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
@@ -167,6 +167,7 @@ def _run_block_of(
         sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
             ring = _aligned_zeros(sampled.delay + 2, width)
+        check_same_delay(sampled, len(ring))
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
         arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,
                      gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip

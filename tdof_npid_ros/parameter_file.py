@@ -33,7 +33,7 @@ def check_only_gains(path: Path) -> None:
     Raises:
         ParameterFileError: it holds something else.
     """
-    if path.exists() and set(_load(path)) != {"/**/controller"}:
+    if path.is_file() and set(_load(path)) != {"/**/controller"}:
         raise ParameterFileError(f"{path} holds more than a controller's gains, which would be lost: give another file")
 
 

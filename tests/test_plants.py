@@ -4,15 +4,19 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import signal
 
+from tdof_npid_ros.case import load_case
+from tdof_npid_ros.loop import simulate
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.scenario import Segment
 
 UNLIMITED = (-math.inf, math.inf)
 
@@ -242,3 +246,22 @@ def test_substeps_are_a_whole_number(substeps: float, tmp_path: Path, monkeypatc
     model = users_plant(f"sub_tank_{int(substeps)}", USERS_PLANT, tmp_path, monkeypatch)
     with pytest.raises(PlantError, match="whole number"):
         make_plant(model, {"substeps": substeps})
+
+
+@pytest.mark.parametrize("dead_time", [0.0, 0.49, 500.0])
+def test_the_dead_time_of_a_plant_that_runs_does_not_change(dead_time: float) -> None:
+    """The efforts on their way have their place: compiled code must not look for more of them."""
+    case = load_case("p1-c0.5")
+    simulator = PlantSimulator(case.plant, case.sample_period_ns, 1, (-math.inf, math.inf))
+    with pytest.raises(PlantError, match="dead_time cannot change"):
+        simulator.change_plant(case.plant_at({"dead_time": dead_time}))
+    signals = replace(case.signals["setpoint"], segments=(Segment(0, 10, {}), Segment(10, 99, {"dead_time": dead_time})))
+    with pytest.raises(PlantError, match="dead_time cannot change"):
+        simulate(case.plant_at, case.gains, signals, case.effort_limits)
+    simulator.change_plant(case.plant_at({"gain": 2.0, "dead_time": 0.5}))
+
+
+def test_numbers_beyond_all_bounds_are_refused() -> None:
+    for values in ({"time_constant": 1e110}, {"dead_time": 1e300}):
+        with pytest.raises(PlantError):
+            make_plant("third_order", values).sampled(10_000_000)

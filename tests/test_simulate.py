@@ -12,7 +12,7 @@ from tdof_npid_ros.case import config_folder, load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.paper.tables import CASES
-from tdof_npid_ros.parameter_file import read_parameters, write_parameters
+from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters, write_parameters
 
 
 def simulated(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, object]:
@@ -74,9 +74,9 @@ def test_a_folder_does_not_hide_a_case(
 
 def test_a_dead_time_beyond_memory_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "slow.yaml"
-    file.write_text((config_folder() / "p1-c4.yaml").read_text().replace("dead_time: 4.0", "dead_time: 1.0e+9"))
+    file.write_text((config_folder() / "p1-c4.yaml").read_text().replace("dead_time: 4.0", "dead_time: 1.0e+6"))
     assert main(["simulate", str(file)]) == 2
-    assert "dead_time is 1e+09 s" in capsys.readouterr().err
+    assert "dead_time is 1e+06 s" in capsys.readouterr().err
 
 
 def status_of(arguments: list[str]) -> int:
@@ -239,3 +239,12 @@ def test_without_ros_the_remedy_is_named(
     monkeypatch.delitem(sys.modules, "tdof_npid_ros.cli.replay", raising=False)
     assert main(["replay", str(tmp_path)]) == 2
     assert "needs ROS 2" in capsys.readouterr().err
+
+
+def test_different_sample_periods_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "loop.yaml"
+    file.write_text("/**/plant: {ros__parameters: {}}\n/**/controller: {ros__parameters: {sample_period: 0.05}}\n")
+    assert load_case(file).sample_period_ns  # the plant's is not given
+    file.write_text(file.read_text().replace("plant: {ros__parameters: {}", "plant: {ros__parameters: {sample_period: 0.01}"))
+    with pytest.raises(ParameterFileError, match=r"sample_period is 0\.01 in plant and 0\.05 in controller"):
+        load_case(file)

@@ -19,6 +19,7 @@ from tdof_npid_ros.metrics import (
     integral_absolute_error,
     setpoint_metrics,
 )
+from tdof_npid_ros.plants.plant import PlantError
 
 MOST_STEPS = 20  # an episode with more changes follows a ramp or a sine: then only its error is measured
 Kind = Literal["setpoint", "disturbance", "plant", "tracking"]
@@ -108,7 +109,10 @@ def deviation(episode: Episode) -> Deviation:
     plant = dict(episode.plant)
     case = Case("", episode.sample_period_ns, str(plant["model"]), plant, _limits(episode), episode.gains[0], {})
     signals = episode.plan.sampled(episode.sample_period_ns)
-    wanted = simulate(case.plant_at, episode.gains[0], signals, case.effort_limits)
+    try:
+        wanted = simulate(case.plant_at, episode.gains[0], signals, case.effort_limits)
+    except PlantError as error:
+        return Deviation(None, None, str(error))
     return Deviation(_largest(wanted.output, episode.output), _largest(wanted.control_effort, episode.control_effort))
 
 

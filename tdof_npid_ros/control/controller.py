@@ -183,13 +183,18 @@ class Controller:
             return
         effort, terms = np.empty_like(self.effort), np.empty_like(self.terms)
         before.answer(setpoint, output, self._state.copy(), self._shaping.copy(), effort, terms)
-        law, derivative = self._law, terms[TERMS.index("derivative")]
+        law, zeros = self._law, np.zeros_like(effort)
+        # The effort goes on, or what the law wants beyond limits that stay: a limit in force is no reason to unwind.
+        limits_stay = (before.least == law.least) & (before.most == law.most) & (not before.operation.manual)
+        wanted = np.where(limits_stay, terms[TERMS.index("unlimited_effort")], effort)
+        # The rate that the filter has found goes on; with another K_d it makes another derivative action.
+        kd, kd_before = self.gains.per_lane("kd"), before.gains.per_lane("kd")
+        derivative = kd * np.divide(terms[TERMS.index("derivative")], kd_before, out=zeros, where=kd_before != 0)
         r, y = law.shaped(setpoint, output, self._shaping)
-        has_derivative = law.c[KD_H] != 0
-        derivative = np.where(has_derivative, derivative, 0.0)
         e_d = law.derivative_error(r, y)
-        self._state[FILTER] = e_d - np.divide(derivative, law.c[KD_H], out=np.zeros_like(e_d), where=has_derivative)
-        self._state[INTEGRAL] = law.integral(effort - law.proportional(r, y) - derivative, self._state[INTEGRAL])
+        back = np.divide(derivative, law.c[KD_H], out=np.zeros_like(e_d), where=law.c[KD_H] != 0)
+        self._state[FILTER] = e_d - back
+        self._state[INTEGRAL] = law.integral(wanted - law.proportional(r, y) - derivative, self._state[INTEGRAL])
 
 
 class _Law:

@@ -151,8 +151,7 @@ def tracking_time(gains: Gains) -> np.ndarray:
     The automatic choice is that of control_toolbox. Without integral action there is nothing to track: infinite.
     """
     kp, ki, kd = (gains.per_lane(name) for name in ("kp", "ki", "kd"))
-    if gains.tracking_time > 0:
-        return np.full(kp.shape, gains.tracking_time)
     with np.errstate(divide="ignore", invalid="ignore"):
         automatic = np.where(kd != 0, np.sqrt(np.abs(kd / ki)), np.abs(kp / ki))
-    return np.where(ki == 0, np.inf, np.where(automatic == 0, np.finfo(float).tiny, automatic))
+    time = gains.tracking_time or np.where(automatic == 0, np.finfo(float).tiny, automatic)
+    return np.where(ki == 0, np.inf, time)

@@ -21,7 +21,7 @@ from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
 from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
+from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd, patience_ns
 from tdof_npid_ros.graph.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.node import (
     ERROR,
@@ -63,6 +63,7 @@ DESCRIPTIONS = {
     "bumpless": "true: changes of gains and type do not move the effort at once",
 }
 RANGES = {"output_timeout": (0.0, 3600.0), **TIMING_RANGES}
+OUT_OF_STEP = "plant and controller differ in sample_period: give both the same"
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
 
@@ -110,7 +111,7 @@ class ControllerNode(LoopEnd):
         """Create topics, services and timers."""
         self.prepare_for_realtime()
         self.stamps.forget()
-        self.waiting = None
+        self.waiting, self.is_out_of_step = None, False
         self.answered = NO_VALUES  # the latest output that was
         self.controller.reset()
         self.takes_output_as_setpoint = bool(self.values_of(["hold_output"])["hold_output"])
@@ -186,6 +187,7 @@ class ControllerNode(LoopEnd):
             if self.takes_output_as_setpoint:
                 self._take_setpoint(y)
             setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
+        before = self.stamps.latest_ns
         verdict = self.stamps.take(stamp, episode)
         if verdict == "late":
             self.counts["late"] += 1
@@ -193,6 +195,8 @@ class ControllerNode(LoopEnd):
         if verdict == "same" and not episode and not np.array_equal(y, self.answered):
             self.refuse("rejected", "output refused: it has changed, but its stamp has not", "; stamp each message")
             return
+        if verdict == "new" and episode and before is not None:
+            self._check_period(stamp - before)
         self.answered = y
         begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, output)
         is_new = self.controller.answer(stamp, setpoint, y)
@@ -201,6 +205,13 @@ class ControllerNode(LoopEnd):
         self.effort_publisher.publish(self.answer)
         # The plant waits for the answer, so all else comes after it.
         self._note_answer(stamp, is_new)
+
+    def _check_period(self, apart_ns: int) -> None:
+        """In lockstep outputs come every sample period; if not, plant and controller were given different ones."""
+        period_ns = self.controller.sample_period_ns
+        self.is_out_of_step = apart_ns != period_ns
+        if self.is_out_of_step:
+            self.refuse("out_of_step", OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s")
 
     def _on_every_lane(self, setpoint: float) -> np.ndarray:
         """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
@@ -313,7 +324,7 @@ class ControllerNode(LoopEnd):
         if "setpoint" in changes:
             self._take_setpoint(self._setpoint(changes["setpoint"]))
         if "output_timeout" in changes:
-            self.output_timeout_ns = round(changes["output_timeout"] * 1e9)
+            self.output_timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
 
     def _configured(self, changes: dict[str, Any]) -> tuple[Gains, Operation]:
         """Gains and operation with some parameters changed; ValueError if they are not valid."""
@@ -354,6 +365,8 @@ class ControllerNode(LoopEnd):
         facts["time_s"] = self.stamps.latest_ns / 1e9
         if self.silent:
             return ERROR, "output has stopped: look after the plant; the effort is as it was", facts
+        if self.is_out_of_step:
+            return ERROR, OUT_OF_STEP, facts
         if self.controller.operation.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts

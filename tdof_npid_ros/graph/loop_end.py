@@ -10,7 +10,13 @@ from tdof_npid_ros.graph.messages import all_within
 from tdof_npid_ros.graph.node import RECENT, RECENT_QOS, LoopNode
 from tdof_npid_ros.graph.timing import prepare_for_realtime
 
+PATIENCE_PERIODS = 3  # without a signal: no silence yet, however slow the loop
 TIMING_RANGES = {"deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}  # s
+
+
+def patience_ns(timeout: float, period_ns: int) -> int:
+    """How long a loop's node waits for a signal: a timeout in s, but some periods at least; 0 for ever."""
+    return max(round(timeout * 1e9), PATIENCE_PERIODS * period_ns) if timeout else 0
 
 
 class LoopEnd(LoopNode):

@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import Any
 
 import rclpy
@@ -39,6 +40,7 @@ DIAGNOSTICS_PERIOD = 1.0  # s
 REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
 LEAVE_TIMEOUT = 2.0  # s until a process ends that the middleware does not let go of
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
+OF_OTHER_NODES = ("sample_period", "mode", "speed")  # which a file may give to all nodes of a loop
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -173,20 +175,35 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     # Parameters
 
     def declare_value(self, name: str, default: Any, description: str, *, fixed: bool = False) -> Any:
-        """Declare a parameter and return its value. Its type is checked by the node, so that 10 does for 10.0."""
+        """Declare a parameter and return its value. Its type is checked by the node, so that 10 does for 10.0.
+
+        Raises:
+            ValueError: it is of another kind than the default.
+        """
         self._defaults[name] = default
         descriptor = ParameterDescriptor(description=description, read_only=fixed, dynamic_typing=True)
-        return plain(self.declare_parameter(name, default, descriptor).value)
+        value = plain(self.declare_parameter(name, default, descriptor).value)
+        check_kind(name, as_float(value) if isinstance(first(default), float) else value, default)
+        return value
 
     def values_of(self, names: Sequence[str]) -> dict[str, Any]:
         """Parameters by name."""
         return {name: plain(self.get_parameter(name).value) for name in names}
 
     def accept_changes(self) -> None:
-        """From now on, parameters may be changed from outside."""
+        """From now on, parameters may be changed from outside; all are declared."""
+        self._warn_of_unknown_parameters()
         self.add_pre_set_parameters_callback(self._as_declared)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
+
+    def _warn_of_unknown_parameters(self) -> None:
+        """ROS passes over what a parameter file gives a node that does not know it, a misspelt gain for one."""
+        for name in self._parameter_overrides:
+            if not self.has_parameter(name) and name not in OF_OTHER_NODES and not name.startswith("qos_overrides."):
+                known = get_close_matches(name, self._defaults, 1)
+                hint = f": {known[0]} is meant?" if known else ""
+                self.get_logger().warning(f"parameter {name} is not one of this node's, and does nothing{hint}")
 
     def _as_declared(self, parameters: list[Parameter]) -> list[Parameter]:
         """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send."""
@@ -204,9 +221,13 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
                 if name in self._defaults:
                     check_kind(name, value, self._defaults[name])
             self.checked(changes)
-        except (ValueError, TypeError) as error:
-            self.counts["refused_parameters"] += 1
-            self.get_logger().warning(f"parameters {', '.join(changes)} refused: {error}")
+        except (ValueError, TypeError, ArithmeticError) as error:
+            cause = f"parameters {', '.join(changes)} refused"
+            if changes.keys() <= self.quiet_parameters:
+                self.refuse("refused_parameters", cause, f": {error}")
+            else:
+                self.counts["refused_parameters"] += 1
+                self.get_logger().warning(f"{cause}: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         self._before = {name: plain(self.get_parameter_or(name).value) for name in changes}
         return SetParametersResult(successful=True)
@@ -265,7 +286,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._activation += 1
         try:
             self.activate()
-        except (ValueError, OSError, RuntimeError) as error:
+        except Exception as error:  # rclpy would only go to an error state, without a word
             self.activation_error = error
             self.get_logger().error(f"not activated: {error}")
             self._leave_what_activate_created()
@@ -380,7 +401,7 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             node = make_node()
             if node.autostart:
-                _autostart(node)
+                autostart(node)
         spin(node, stop)
         status = 0
     except StartError as error:
@@ -406,11 +427,16 @@ def _start_errors() -> Iterator[None]:
         raise StartError(" ".join(str(error).split())) from error
 
 
-def _autostart(node: LoopNode) -> None:
+def autostart(node: LoopNode) -> None:
+    """Configure and activate a node.
+
+    Raises:
+        RuntimeError: it cannot be activated; the message says why.
+    """
     node.trigger_configure()
     node.trigger_activate()
     if node.activation_error is not None:
-        raise node.activation_error
+        raise RuntimeError(" ".join(str(node.activation_error).split())) from node.activation_error
 
 
 def _end(node: LoopNode, status: int) -> None:

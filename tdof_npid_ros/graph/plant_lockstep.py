@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rosgraph_msgs.msg import Clock as ClockMessage
 from trajectory_msgs.msg import JointTrajectory
@@ -17,6 +17,7 @@ from tdof_npid_ros.signals import Sample
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.plant_node import PlantNode
 
+Phase = Literal["waiting", "running", "stopped", "finished"]
 CLOCK_PERIOD = 0.05  # s of wall time between two /clock messages
 
 
@@ -28,11 +29,12 @@ class LockstepPlant:
         self.plan: Plan | None = None
         self.episode: Episode | None = None
         self.episodes = 0
-        self.running = self.stopped = False
+        self.phase: Phase = "waiting"
 
     def activate(self) -> None:
-        """Create the topics and timers."""
+        """Create the topics and timers, and wait for the plan, which is latched."""
         node = self._node
+        self.plan, self.episode, self.phase = None, None, "waiting"
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
@@ -46,29 +48,30 @@ class LockstepPlant:
 
     def _on_plan(self, message: JointTrajectory) -> None:
         try:
-            plan = plan_from_message(message)
-            Episode(plan, self._node.simulator, self._node.plant_at, 0)
-        except ValueError as error:
+            self._start_episode(plan_from_message(message))
+        except (ValueError, ArithmeticError) as error:
             self._node.refuse("rejected", "scenario_plan refused", f": {error}")
-            return
-        self.plan = plan
-        self._start_episode(plan)
 
     def reset(self) -> tuple[bool, str]:
         """The plan once more."""
         if self.plan is None:
             return False, "no plan on scenario_plan yet: start the scenario"
-        self._start_episode(self.plan)
+        try:
+            self._start_episode(self.plan)
+        except (ValueError, ArithmeticError) as error:
+            return False, str(error)
         return True, f"episode {self.episodes} of plan {self.plan.digest} started"
 
     def _start_episode(self, plan: Plan) -> None:
+        """Begin it; a plan that the plant cannot follow raises ValueError, and changes nothing."""
         node = self._node
+        simulator = node.new_simulator()
+        episode = Episode(plan, simulator, node.plant_at, self.episodes + 1)
+        node.simulator, self.plan, self.episode = simulator, plan, episode
         self.episodes += 1
-        node.make_simulator()
-        self.episode = Episode(plan, node.simulator, node.plant_at, self.episodes)
-        node.label_output(self.episode.name)
-        self.running, self.stopped, self.repeats = True, False, 0
-        node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {self.episode.steps} steps")
+        self.phase, self.repeats = "running", 0
+        node.label_output(episode.name)
+        node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {episode.steps} steps")
         self.held = False
         node.publish_output(0)
         node.publish_diagnostics()
@@ -77,7 +80,7 @@ class LockstepPlant:
         node, episode = self._node, self.episode
         if (
             episode is None
-            or not (self.running or self.stopped)
+            or self.phase == "finished"
             or not episode.awaits(answer.stamp_ns, answer.frame_id)
         ):
             node.counts["late"] += 1
@@ -87,17 +90,17 @@ class LockstepPlant:
             return
         if not self._is_logged(episode):
             return  # it comes again
-        if self.stopped:
+        if self.phase == "stopped":
             node.get_logger().info("the controller answers again: going on")
-            self.running, self.stopped = True, False
+            self.phase = "running"
         if episode.answer(effort):
             self._publish_when_logged(episode)
         else:
-            self.running = False
+            self.phase = "finished"
             node.get_logger().info(f"episode {self.episodes} finished")
             self._publish_clock()
         node.counts["steps"] += 1
-        if not self.running:
+        if self.phase == "finished":
             node.publish_diagnostics()
 
     def _publish_when_logged(self, episode: Episode) -> None:
@@ -106,7 +109,7 @@ class LockstepPlant:
             self._node.publish_output(episode.stamp_ns)
 
     def _on_log_grown(self) -> None:
-        if not self.running or self.episode is None:
+        if self.phase != "running" or self.episode is None:
             return
         if self.held:
             self._publish_when_logged(self.episode)
@@ -122,7 +125,7 @@ class LockstepPlant:
 
     def _on_reply_timeout(self) -> None:
         node, episode = self._node, self.episode
-        if not self.running or episode is None:
+        if self.phase != "running" or episode is None:
             return
         if self.held or not self._is_logged(episode):
             node.refuse("held_up", "lossless: waiting for the recorder; start one with lossless in this namespace")
@@ -134,7 +137,7 @@ class LockstepPlant:
             self.waiting, self.repeats = waiting, 0
             return
         if self.repeats >= node.values_of(["retries"])["retries"]:
-            self.running, self.stopped = False, True
+            self.phase = "stopped"
             node.get_logger().error(
                 f"no answer to the output at {episode.stamp_ns / 1e9:g} s after {self.repeats} repetitions: stopped. "
                 "Start a controller in this namespace, or call plant/reset"
@@ -155,8 +158,8 @@ class LockstepPlant:
         if self.episode is None or status.current_count_change <= 0:
             return
         self.repeats = 0  # what was published before, it may not have heard
-        if self.stopped:
-            self.running, self.stopped = True, False
+        if self.phase == "stopped":
+            self.phase = "running"
             self._repeat_output(self.episode)
 
     def _publish_clock(self) -> None:
@@ -171,16 +174,15 @@ class LockstepPlant:
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """As `LoopNode.state`."""
-        name = "running" if self.running else "stopped" if self.stopped else "finished" if self.episodes else "waiting"
         facts: dict[str, object] = {
             "episode": self.episodes,
-            "state": name,
+            "state": self.phase,
             "plan": self.plan.digest if self.plan else "",
         }
         if self.episode is not None:
             facts["time_s"] = self.episode.stamp_ns / 1e9
-        if self.stopped:
+        if self.phase == "stopped":
             return ERROR, "no controller answers: start one, or call plant/reset", facts
-        if name == "waiting":
+        if self.phase == "waiting":
             return WARN, "waiting for a plan on scenario_plan: start the scenario", facts
-        return OK, name, facts
+        return OK, self.phase, facts

@@ -10,7 +10,7 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from tdof_npid_ros.case import sample_period_in_ns
+from tdof_npid_ros.case import changeable_parameters, sample_period_in_ns
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
 from tdof_npid_ros.graph.messages import lane_names
@@ -18,7 +18,7 @@ from tdof_npid_ros.graph.node import number, run_node
 from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant_realtime import RealtimePlant
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.signals import Sample, SignalWriter
 
@@ -55,7 +55,7 @@ class PlantNode(LoopEnd):
         self.checked({})
         self.accept_changes()
         self.output = SignalWriter()
-        self.make_simulator()
+        self.simulator = self.new_simulator()
         self.simulator.warm_up()
         self.way_of_running = MODES[self.mode](self)
 
@@ -112,13 +112,24 @@ class PlantNode(LoopEnd):
         return effort if self.takes("control_effort", effort) else None
 
     def plant_at(self, changes: dict[str, float]) -> Plant:
-        """The plant with some parameters changed."""
+        """The plant with some parameters changed.
+
+        Raises:
+            PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
+        """
+        changeable = changeable_parameters(self.model, self.values_of(self.model_names))
+        for name in changes:
+            if name not in changeable:
+                raise PlantError(
+                    f"plant.{name} cannot change while the loop runs: with model {self.model} these can: "
+                    f"{', '.join(changeable) or 'none'}"
+                )
         return make_plant(self.model, {**self.values_of(self.model_names), **changes})
 
-    def make_simulator(self) -> None:
-        """Begin again, at the initial state, with the parameters as they are now."""
+    def new_simulator(self) -> PlantSimulator:
+        """The plant at its initial state, with the parameters as they are now."""
         lanes = int(self.values_of(["lanes"])["lanes"])
-        self.simulator = PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
+        return PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
 
     def label_output(self, episode: str) -> None:
         """What the outputs bear in `header.frame_id` from now on, beside the names of the lanes."""

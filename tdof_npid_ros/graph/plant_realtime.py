@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tdof_npid_ros.graph.endpoints import signal_qos
+from tdof_npid_ros.graph.loop_end import patience_ns
 from tdof_npid_ros.graph.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.timing import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
@@ -34,7 +35,7 @@ class RealtimePlant:
 
     def reset(self) -> tuple[bool, str]:
         """Back to the initial state, at time 0."""
-        self._node.make_simulator()
+        self._node.simulator = self._node.new_simulator()
         self._node.label_output("")
         self._start()
         return True, "at the initial state, time 0"
@@ -50,7 +51,7 @@ class RealtimePlant:
     def _failsafe_settings(self) -> tuple[int, float | None, int]:
         p = self._node.values_of(["effort_timeout", "fallback", "fallback_effort", "return_time"])
         fallback = float(p["fallback_effort"]) if p["fallback"] == "effort" else None
-        return round(p["effort_timeout"] * 1e9), fallback, round(p["return_time"] * 1e9)
+        return patience_ns(p["effort_timeout"], self.wall_period_ns), fallback, round(p["return_time"] * 1e9)
 
     def _on_tick(self) -> None:
         node, now = self._node, STEADY.now().nanoseconds
@@ -91,10 +92,10 @@ class RealtimePlant:
             self._node.get_logger().info("control_effort comes again: going over to it")
 
     def _report_silence(self) -> None:
-        p = self._node.values_of(["effort_timeout", "fallback", "fallback_effort"])
+        p = self._node.values_of(["fallback", "fallback_effort"])
         does = f"taking fallback_effort {p['fallback_effort']:g}" if p["fallback"] == "effort" else "holding the last"
         self._node.counts["silences"] += 1
-        self._node.get_logger().error(f"no control_effort for {p['effort_timeout']:g} s: {does}")
+        self._node.get_logger().error(f"no control_effort for {self._failsafe_settings()[0] / 1e9:g} s: {does}")
 
     def _on_disturbance(self, sample: Sample) -> None:
         lanes = self._node.simulator.lanes

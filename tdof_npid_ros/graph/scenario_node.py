@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -18,6 +18,7 @@ from tdof_npid_ros.graph.messages import lane_names, plan_message, set_stamp, si
 from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
 from tdof_npid_ros.scenario import Plan, parse_plan
 
+PLANT = "plant."  # what begins the name of a plant's parameter in a plan
 PLANT_TIMEOUT_NS = 3_000_000_000  # in realtime, an episode waits so long for a plant that can be reset
 
 
@@ -39,7 +40,7 @@ class ScenarioNode(LoopNode):
         speed = self.declare_value("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
         self.speed = number("speed", speed, 1e-3, 1e3)
         self.play_at_start = bool(
-            self.declare_value("play", True, "play all episodes at the start; else at scenario/play")
+            self.declare_value("play", True, "play all episodes at the start; else at scenario/play", fixed=True)
         )
         self.declare_value("episodes", ["setpoint"], "names of the episodes, in the order in which they are played")
         for name in self.values_of(["episodes"])["episodes"]:
@@ -51,6 +52,7 @@ class ScenarioNode(LoopNode):
         self.played = 0
         self.reported_episode = 0  # by the plant
         self.latest_episode = self.finished_before = 0  # of the plant, that was played to its end; and before `current`
+        self.plant_before: list[Parameter] = []  # in realtime: what the plan has changed of the plant, as it was
         self.queue: list[Plan] = []
         self.current: Plan | None = None
 
@@ -68,13 +70,15 @@ class ScenarioNode(LoopNode):
             self.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
         else:
             self.reset_client = self.create_client(Trigger, "plant/reset")
-            self.parameter_client = self.create_client(SetParameters, "plant/set_parameters")
+            self.get_client = self.create_client(GetParameters, "plant/get_parameters")
+            self.set_client = self.create_client(SetParameters, "plant/set_parameters")
             self.create_timer(self.period_ns / 1e9 / self.speed, self._on_tick, clock=STEADY)
         if self.play_at_start:
             self._play()
 
     def deactivate(self) -> None:
         """Forget the episode that is being played."""
+        self._restore_plant()
         self.queue, self.current = [], None
 
     # Playing
@@ -93,6 +97,7 @@ class ScenarioNode(LoopNode):
 
     def _next(self) -> None:
         """Begin the next episode, if there is one."""
+        self._restore_plant()
         if not self.queue:
             self.current = None
             self.played += 1
@@ -116,6 +121,7 @@ class ScenarioNode(LoopNode):
             self.reset_client.call_async(Trigger.Request())
         else:
             self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
+        self._remember_plant([name for name in plan.names if name.startswith(PLANT)])
         self.started_ns = STEADY.now().nanoseconds
         self._publish_plan(plan)
 
@@ -169,7 +175,7 @@ class ScenarioNode(LoopNode):
             self._publish_signals(plan, self.point)
             if self.mode == "realtime":
                 row = zip(plan.names, plan.values[self.point], strict=True)
-                self._set_plant({name.removeprefix("plant."): v for name, v in row if name.startswith("plant.")})
+                self._set_plant([_double(name, value) for name, value in row if name.startswith(PLANT)])
 
     def _publish_signals(self, plan: Plan, point: int) -> None:
         row = dict(zip(plan.names, plan.values[point], strict=True))
@@ -181,21 +187,42 @@ class ScenarioNode(LoopNode):
             setattr(message, field, [row.get(name, 0.0)])
             publisher.publish(message)
 
-    def _set_plant(self, parameters: dict[str, float]) -> None:
-        if parameters:
-            kind = ParameterType.PARAMETER_DOUBLE
-            request = SetParameters.Request()
-            request.parameters = [
-                Parameter(name=name, value=ParameterValue(type=kind, double_value=value))
-                for name, value in parameters.items()
-            ]
-            self.parameter_client.call_async(request)
+    def _remember_plant(self, names: list[str]) -> None:
+        """Ask what the plan will change, before it does: the next episode begins with what was configured."""
+        if not names:
+            return
+
+        def remember(answer: Any) -> None:
+            values = answer.result().values
+            found = [Parameter(name=n, value=v) for n, v in zip(request.names, values, strict=False)]
+            self.plant_before = [parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET]
+
+        request = GetParameters.Request(names=[name.removeprefix(PLANT) for name in names])
+        self.get_client.call_async(request).add_done_callback(remember)
+
+    def _restore_plant(self) -> None:
+        before, self.plant_before = self.plant_before, []
+        self._set_plant(before)
+
+    def _set_plant(self, parameters: list[Parameter]) -> None:
+        if not parameters:
+            return
+
+        def look(answer: Any) -> None:
+            for parameter, result in zip(parameters, answer.result().results, strict=False):
+                if not result.successful:
+                    self.refuse("rejected", f"{PLANT}{parameter.name} was refused by the plant", f": {result.reason}")
+
+        self.set_client.call_async(SetParameters.Request(parameters=parameters)).add_done_callback(look)
 
     # Parameters and state
 
     def _read_plans(self, changes: dict[str, Any]) -> None:
         names = changes.get("episodes", self.values_of(["episodes"])["episodes"])
-        declared = [f"plan.{name}" for name in names if self.has_parameter(f"plan.{name}")]
+        declared = [f"plan.{name}" for name in names]
+        for name in declared:
+            if not self.has_parameter(name):
+                raise ValueError(f"{name} was not there at the start: start the scenario with its episode in episodes")
         parameters = {"episodes": names, **self.values_of(declared), **changes}
         self.plans = {}
         for name, lines in read_episodes(parameters).items():
@@ -219,6 +246,12 @@ class ScenarioNode(LoopNode):
         if self.current:
             facts["plan"] = self.current.digest
         return OK, str(facts["state"]), facts
+
+
+def _double(name: str, value: float) -> Parameter:
+    """A change of the plan, `plant.gain` say, as the plant's parameter."""
+    kind = ParameterType.PARAMETER_DOUBLE
+    return Parameter(name=name.removeprefix(PLANT), value=ParameterValue(type=kind, double_value=value))
 
 
 def main(args: list[str] | None = None) -> None:

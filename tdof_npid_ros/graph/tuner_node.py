@@ -30,6 +30,7 @@ from tdof_npid_ros.graph.node import (
     OK,
     STOP_SIGNALS,
     LoopNode,
+    autostart,
     executor_for,
     number,
 )
@@ -94,6 +95,7 @@ class TunerNode(LoopNode):
         if self.result_file is not None:
             check_writable(self.result_file)
             check_only_gains(self.result_file)
+        self.accept_changes()
         self.study = Study(self.problem, checkpoint, bool(resume))
         self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"
 
@@ -319,8 +321,7 @@ def _serve(node: TunerNode) -> int:
     status = 0
     try:
         if node.autostart:
-            node.trigger_configure()
-            node.trigger_activate()
+            autostart(node)
         node.run()
     except InterruptedTuningError as error:
         node.report("interrupted", str(error))

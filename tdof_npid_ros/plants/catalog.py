@@ -59,7 +59,7 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     if model == "second_order":
         return TransferFunction((p["gain"],), (t * t, 2.0 * t, 1.0), p["dead_time"])
     k, c = p["gain"], p["zero_time_constant"]
-    return TransferFunction((-k * c, k), (t**3, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"])
+    return TransferFunction((-k * c, k), (t * t * t, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"])
 
 
 def _typed(name: str, value: Any, default: float | list[float]) -> Any:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from numba import types
 
 from tdof_npid_ros.compiled import compiled, implementation_of, uncached
+from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.plants.states import along, linear_map, runge_kutta_mean
 
 
@@ -49,6 +50,16 @@ class SampledOde(NamedTuple):
 def kernel_for(plant: Any, entry: Any) -> Any:
     """The entry point to call with a plant: as it is, or uncached for a user's own plant."""
     return uncached(entry) if isinstance(plant, SampledOde) else entry
+
+
+def check_same_delay(plant: Any, slots: int) -> None:
+    """Make sure that a sampled plant fits the `slots` that the efforts on their way have: compiled code does not look.
+
+    Raises:
+        PlantError: it does not.
+    """
+    if plant.delay + 2 != slots:
+        raise PlantError("dead_time cannot change while the loop runs: begin a new episode with it")
 
 
 def plant_output(plant: Any, x: Any) -> Any:

@@ -15,7 +15,8 @@ from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
 
-LONGEST_DEAD_TIME = 1_000_000  # samples: what a lane's efforts on their way take of memory is 8 MB
+LONGEST_DEAD_TIME = 1e9  # s
+MOST_DELAY = 1_000_000  # samples: what a lane's efforts on their way take of memory is 8 MB
 
 _PRECISION = threading.Lock()  # mpmath's precision belongs to the whole process
 
@@ -47,8 +48,8 @@ class TransferFunction:
                 f"numerator of degree {len(self.numerator) - 1} over denominator of degree "
                 f"{len(self.denominator) - 1}: the numerator's degree must be the lower one (strictly proper)"
             )
-        if not 0 <= self.dead_time < math.inf:
-            raise PlantError(f"dead_time is {self.dead_time} s: it must be finite and not negative")
+        if not 0 <= self.dead_time <= LONGEST_DEAD_TIME:
+            raise PlantError(f"dead_time is {self.dead_time} s: it must be from 0 to {LONGEST_DEAD_TIME:g}")
 
     @property
     def initial_state(self) -> tuple[float, ...]:
@@ -81,10 +82,8 @@ def _sample(
     and v[k-delay] for the rest: both contributions are blocks of exp([[A, B], [0, 0]] t).
     """
     delay, late_ns = divmod(dead_time_ns, period_ns)
-    if delay > LONGEST_DEAD_TIME:
-        raise PlantError(
-            f"dead_time is {dead_time_ns / 1e9:g} s, {delay:,} samples: it must not be more than {LONGEST_DEAD_TIME:,}"
-        )
+    if delay > MOST_DELAY:
+        raise PlantError(f"dead_time is {dead_time_ns / 1e9:g} s, {delay:,} samples: it must not be more than {MOST_DELAY:,}")
     with _PRECISION, mpmath.workdps(DIGITS):
         period, late = mpmath.mpf(period_ns) / 10**9, mpmath.mpf(late_ns) / 10**9
         a, b = _observable_form(numerator, denominator)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.plants.kernels import kernel_for
+from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for
 from tdof_npid_ros.plants.lanes import advance_lanes, output_lanes
 from tdof_npid_ros.plants.plant import Plant
 
@@ -23,19 +23,27 @@ class PlantSimulator:
         self.lanes = lanes
         self.sample_period_ns = sample_period_ns
         self.effort_limits = effort_limits
+        self._ring: np.ndarray | None = None
         self._initial = plant
-        self.change_plant(plant)
         self.reset()
 
     def change_plant(self, plant: Plant) -> None:
-        """Go on with other parameters; the state is kept."""
-        self._sampled: Any = plant.sampled(self.sample_period_ns)
+        """Go on with other parameters; the state is kept.
+
+        Raises:
+            PlantError: the dead time is another one.
+        """
+        sampled: Any = plant.sampled(self.sample_period_ns)
+        if self._ring is not None:
+            check_same_delay(sampled, len(self._ring) // self.lanes)
+        self._sampled = sampled
         self._like = plant.initial_state
         self._advance_lanes = kernel_for(self._sampled, advance_lanes)
 
     def reset(self, plant: Plant | None = None) -> None:
         """Back to the initial state at time 0, with the parameters of `plant`, by default those at the start."""
         plant = plant or self._initial
+        self._ring = None
         self.change_plant(plant)
         self._x = np.repeat(np.array(plant.initial_state), self.lanes)
         self._ring = np.zeros((self._sampled.delay + 2) * self.lanes)

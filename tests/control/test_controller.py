@@ -70,6 +70,34 @@ def test_changing_any_gain_or_the_type_is_bumpless(change: dict[str, Any]) -> No
     assert max(abs(np.diff([u, *changed.run(3)]))) < 0.2  # and nothing that was put off comes after
 
 
+@pytest.mark.parametrize("kd", [0.001, 0.01, 0.05])
+def test_a_smaller_derivative_gain_jumps_neither_at_once_nor_later(kd: float) -> None:
+    """With it the filter is faster: what it is given at the change would be gone a sample later."""
+    changed, unchanged = Loop(), Loop()
+    changed.run(60)
+    unchanged.run(60)
+    changed.change({"kd": kd})
+    largest = max(abs(np.diff(unchanged.run(20))))
+    assert max(abs(np.diff(changed.efforts[-1:] + changed.run(20)))) < 2.0 * largest
+
+
+@pytest.mark.parametrize("change", [{"n": 11.0}, {"tracking_time": 2.0}, {"manual_effort": 1.0}], ids=str)
+def test_a_change_without_effect_has_none_at_a_limit(change: dict[str, Any]) -> None:
+    """A limit in force is no reason to throw the integral action away."""
+    gains = Gains("pid", kp=5.0, ki=1.0, effort_min=-12.0, effort_max=12.0)
+    changed, unchanged = Loop(gains, setpoint=10.0), Loop(gains, setpoint=10.0)
+    assert changed.run(50)[-1] == unchanged.run(50)[-1] == 12.0
+    is_gain = "manual_effort" not in change
+    changed.change(change if is_gain else {}, **({} if is_gain else change))
+    assert changed.run(500) == pytest.approx(unchanged.run(500), abs=1e-9)
+
+
+def test_without_integral_action_there_is_nothing_to_track() -> None:
+    gains = Gains("pid", kp=5.0, ki=0.0, effort_min=-1.0, effort_max=1.0)
+    tracking, plain = Loop(gains.with_values(anti_windup="back_calculation", tracking_time=1.0)), Loop(gains)
+    assert tracking.run(500) == plain.run(500)
+
+
 def test_without_bumpless_a_change_acts_at_once() -> None:
     loop = Loop(operation=Operation(bumpless=False))
     before = loop.run(60)[-1]

@@ -16,6 +16,7 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.scenario import parse_plan
 
 AT_ONCE = 2.5  # s; some 0.3 s on a quiet machine
 PERIOD_NS = 5_000_000
@@ -215,6 +216,7 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
         ("controller", {"kp": "much"}, "kp"),
         ("controller", {"sigma": -1.0}, "sigma"),
         ("controller", {"sample_period": 0.0}, "sample_period"),
+        ("controller", {"cpu": 0.5}, "cpu is 0.5: it must be a whole number"),
         ("plant", {"mode": "fast"}, "mode"),
         ("plant", {"model": "no.such:Plant"}, "no.such"),
         ("plant", {"lanes": 0}, "lanes"),
@@ -229,6 +231,62 @@ def test_bad_start_parameters_are_one_line_and_status_2(
     assert process.process.wait(30) == 2
     lines = process.log.strip().splitlines()
     assert len(lines) == 1 and reason in lines[0], process.log
+
+
+def test_a_misspelt_parameter_is_warned_of(graph: Any) -> None:
+    plant = graph.start("plant", gian=2.0, sample_period=0.01)
+    graph.wait_for_nodes("/plant")
+    assert "parameter gian is not one of this node's, and does nothing: gain is meant?" in plant.log
+    assert plant.log.count("not one of this node's") == 1
+
+
+def test_what_a_plant_cannot_do_is_refused_and_it_goes_on(graph: Any) -> None:
+    from trajectory_msgs.msg import JointTrajectory
+
+    from tdof_npid_ros.graph.messages import plan_message
+    from tdof_npid_ros.graph.node import LATCHED_QOS
+
+    plant = graph.start("plant", model="third_order", mode="lockstep")
+    graph.wait_for_nodes("/plant")
+    (result,) = graph.set_parameters("/plant", time_constant=1e110)
+    assert not result.successful
+    publisher = graph.publisher("scenario_plan", JointTrajectory, LATCHED_QOS)
+    changeable = {"dead_time": 0.0, "nonsense": 0.0, "gain": 1.0}
+    for count, lines in enumerate((["0 plant.dead_time 500"], ["0 plant.nonsense 1"]), 1):
+        publisher.publish(plan_message(parse_plan([*lines, "1 end"], PERIOD_NS, changeable), 0))
+        graph.wait_until(lambda n=count: int(graph.fact("/plant", "rejected", 0)) == n, what="a refusal")
+    assert "plant.dead_time cannot change while the loop runs: with model third_order these can: gain" in plant.log
+    publisher.publish(plan_message(parse_plan(["0 plant.gain 2", "1 end"], PERIOD_NS, changeable), 0))
+    graph.wait_until(lambda: graph.fact("/plant", "episode") == "1", what="a plan that it can follow")
+
+
+def test_a_lockstep_plant_that_is_activated_again_begins_anew(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory
+
+    from tdof_npid_ros.graph.messages import plan_message
+    from tdof_npid_ros.graph.node import LATCHED_QOS
+
+    outputs = graph.collect("output", JointState)
+    graph.start("plant", mode="lockstep", case="p1-c0.5")
+    graph.start("controller", case="p1-c0.5")
+    graph.wait_for_nodes("/plant", "/controller")
+    publisher = graph.publisher("scenario_plan", JointTrajectory, LATCHED_QOS)
+    publisher.publish(plan_message(parse_plan(["0 setpoint 1", "1000 end"], 5_000_000), 0))
+    graph.wait_until(lambda: len(outputs) > 100, what="a loop that runs")
+    graph.node.destroy_publisher(publisher)
+    assert graph.change_state("/plant", "deactivate")
+    assert graph.change_state("/plant", "activate")
+    graph.wait_for_nodes("/plant")
+    assert graph.fact("/plant", "state") == "waiting"
+
+
+def test_different_sample_periods_are_told(graph: Any) -> None:
+    graph.start("controller", case="p1-c0.5", sample_period=0.05)
+    graph.start("plant", case="p1-c0.5")
+    graph.start("scenario", case="p1-c0.5")
+    graph.wait_until(lambda: graph.fact("/controller", "level", 0) == 2, 60, "a controller that tells")
+    assert graph.fact("/controller", "message") == "plant and controller differ in sample_period: give both the same"
 
 
 @pytest.fixture(scope="module")

@@ -39,6 +39,36 @@ def test_figures_and_speed(graph: Any) -> None:
     assert set(b - a for a, b in zip(stamps, stamps[1:], strict=False)) == {10_000_000}
 
 
+def test_a_loop_slower_than_its_timeouts_is_not_silent(graph: Any) -> None:
+    """A sample period above effort_timeout and output_timeout, as of a furnace."""
+    from sensor_msgs.msg import JointState
+
+    slow = {"sample_period": 0.6}
+    outputs = graph.collect("output", JointState)
+    graph.start("plant", time_constant=1.0, dead_time=0.0, **slow)
+    graph.start("controller", kp=0.5, ki=1.0, setpoint=1.0, **slow)
+    graph.wait_until(lambda: outputs and outputs[-1].position[0] > 0.4, what="an output that follows")
+    graph.wait_for_nodes("/plant", "/controller")
+    for node in ("/plant", "/controller"):
+        assert graph.fact(node, "silences", "0") == "0", node
+
+
+def test_in_realtime_each_episode_begins_with_the_configured_plant(graph: Any) -> None:
+    quick = {"sample_period": 0.01, "speed": 10.0}
+    graph.start("plant", **quick, gain=1.5)
+    graph.wait_for_nodes("/plant")
+    scenario = graph.start(
+        "scenario",
+        episodes=["a", "b"],
+        plan__a=["0 plant.gain 3", "0 plant.dead_time 2", "10 end"],
+        plan__b=["0 setpoint 1", "50 end"],
+        **quick,
+    )
+    graph.wait_until(lambda: graph.get_parameters("/plant", "gain") == [3.0], what="the change that the plan makes")
+    graph.wait_until(lambda: graph.get_parameters("/plant", "gain") == [1.5], what="the gain as it was")
+    graph.wait_for_log(scenario, "plant.dead_time was refused by the plant")
+
+
 def test_soak_at_200_hz(graph: Any) -> None:
     """No answer is missed and memory stays flat; TDOF_SOAK_SECONDS=600 is the long version."""
     live = Live(graph, "/soak", {"sample_period": 0.005}, {"sample_period": 0.005})
