@@ -11,8 +11,8 @@ bounds by the share 1 - r^((1 - t/T)^shape): anywhere at first, hardly at all to
 That finds the valley of a good controller in a generation or two and then creeps along it. So by default the HGA
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
 and asks for the model's minimum and for samples about it, shaped like the cloud of kept points. When that has
-stalled, it restarts from a new random population, and polishes more patiently, until the budget is spent. Every
-candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
+stalled, it restarts from a new random population, dense at the bounds, and polishes more patiently, until the budget
+is spent. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
 
 A run is the same on every machine: NumPy's PCG64 drawn only for uniform numbers, elementwise arithmetic, decimal
 powers, no BLAS and no math library.
@@ -93,14 +93,18 @@ class HGA(Optimizer):
         self._unit = self._new_round()
 
     def _new_round(self) -> Array:
-        """Forget all but the global best and draw a random population."""
+        """Forget all but the global best and draw a random population, after the first round densely at the bounds.
+
+        A valley that lies along a bound is often narrow, and a uniform population misses it.
+        """
         self._round += 1
         self._age = 0
         self._points = np.empty((0, self.dimension))
         self._values = np.empty(0)
         self._goal = float("inf")
         self._waited = 0
-        return self._random.random((self.population, self.dimension))
+        uniform = self._random.random((self.population, self.dimension))
+        return uniform if self._round == 0 else uniform * uniform * (3.0 - 2.0 * uniform)
 
     @property
     def _kept(self) -> int:
