@@ -148,6 +148,8 @@ class Case:
         for name, values in (("setpoint", signals.setpoint), ("disturbance", signals.disturbance)):
             if np.any(values != values[0]):
                 raise _no_single_step(self, episode, f"the {name} changes after 0 s")
+        if len(signals.segments) > 1:
+            raise _no_single_step(self, episode, "the plant changes after 0 s")
         return output, float(signals.setpoint[0]), float(signals.disturbance[0])
 
 

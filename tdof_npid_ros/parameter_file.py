@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,18 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     return shared | own
 
 
-def check_only_gains(path: Path) -> None:
-    """Make sure that a file, if it is there, holds gains as `write_parameters` writes them, and nothing else to lose.
+def check_replaceable(path: Path, node: str, names: Collection[str]) -> None:
+    """Make sure that a file, if it is there, is as `write_parameters` writes these parameters: nothing else is lost.
 
     Raises:
         ParameterFileError: it holds something else.
     """
-    if path.is_file() and set(_load(path)) != {"/**/controller"}:
-        raise ParameterFileError(f"{path} holds more than a controller's gains, which would be lost: give another file")
+    if not path.is_file() or not path.stat().st_size:
+        return
+    document = _load(path)
+    values = document.get(f"/**/{node}", {}).get("ros__parameters", {})
+    if set(document) != {f"/**/{node}"} or not set(values) <= set(names) or path.read_text("utf-8") != _text(document):
+        raise ParameterFileError(f"{path} holds more than such a result, which would be lost: give another file")
 
 
 def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:
@@ -45,9 +50,13 @@ def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:
     """
     document = {f"/**/{node}": {"ros__parameters": values} for node, values in nodes.items()}
     try:
-        path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        path.write_text(_text(document), encoding="utf-8")
     except OSError as error:
         raise ParameterFileError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _text(document: dict[str, Any]) -> str:
+    return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True))
 
 
 def _load(path: Path) -> dict[str, Any]:

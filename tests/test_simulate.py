@@ -181,6 +181,7 @@ LOOP = (
         ({"setpoint": '"0 setpoint 1", "30 setpoint 2"'}, "the setpoint changes after 0 s"),
         ({"setpoint": '"0 setpoint 1", "9 disturbance 1"'}, "the disturbance changes after 0 s"),
         ({"disturbance": '"9 disturbance 1"'}, "the disturbance changes after 0 s"),
+        ({"setpoint": '"0 setpoint 1", "0 plant.gain 1", "9 plant.gain 2"'}, "the plant changes after 0 s"),
         ({"disturbance": '"0 setpoint 1", "0 disturbance 1"'}, "the setpoint is 1, but the output begins at 0"),
     ],
 )

@@ -18,7 +18,8 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.stamps import RESTART_NS
 from tdof_npid_ros.scenario import Plan, episode_named, parse_plan
 
-LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one episode; a robot's first message may be stamped 0
+LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
+LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
 MOST_SAMPLES = 10_000_000  # of an episode without a plan, as plans have at most
 UNPLANNED = "recording"  # the name of an episode without a plan
 
@@ -118,7 +119,11 @@ def _stretches(signal: Signal) -> list[slice]:
         return []
     stamps = signal.stamp_ns
     back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > RESTART_NS))
-    starts = {0, *(np.flatnonzero(back | (stamps[1:] - stamps[:-1] > LONGEST_GAP_NS)) + 1).tolist()}
+    starts = {0, *(np.flatnonzero(back) + 1).tolist()}
+    steps = np.diff(stamps)
+    gap_ns = max(LONGEST_GAP_NS, LONGEST_GAP_PERIODS * int(np.median(steps))) if len(steps) else LONGEST_GAP_NS
+    ahead = (np.flatnonzero(steps > gap_ns) + 1).tolist()
+    starts |= {first for first in ahead if not _episode_of(signal, slice(first, first + 1))}
     runs = signal.runs()
     for before, run in zip(runs, runs[1:], strict=False):
         if _episode_of(signal, before) != _episode_of(signal, run):

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the new bag and say what is missing; 0 also when something is."""
-    bag = arguments.bag.resolve()
+    bag = arguments.bag.absolute()
     name = bag.name if bag.is_dir() else bag.stem
     report = recover(arguments.bag, arguments.destination or bag.with_name(f"{name}-recovered"))
     if arguments.json:

@@ -19,9 +19,9 @@ import numpy as np
 from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import response_report
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
 from tdof_npid_ros.output_file import check_outputs
-from tdof_npid_ros.parameter_file import check_only_gains, write_parameters
+from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
@@ -107,7 +107,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     written = [path for path in (arguments.checkpoint, arguments.out, arguments.plot) if path]
     check_outputs(written, [find_parameter_file(arguments.case)])
     if arguments.out:
-        check_only_gains(arguments.out)
+        check_replaceable(arguments.out, "controller", Gains().as_dict())
 
 
 @contextmanager

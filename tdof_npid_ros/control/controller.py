@@ -183,18 +183,29 @@ class Controller:
             return
         effort, terms = np.empty_like(self.effort), np.empty_like(self.terms)
         before.answer(setpoint, output, self._state.copy(), self._shaping.copy(), effort, terms)
-        law, zeros = self._law, np.zeros_like(effort)
-        # The effort goes on, or what the law wants beyond limits that stay: a limit in force is no reason to unwind.
-        limits_stay = (before.least == law.least) & (before.most == law.most) & (not before.operation.manual)
-        wanted = np.where(limits_stay, terms[TERMS.index("unlimited_effort")], effort)
-        # The rate that the filter has found goes on; with another K_d it makes another derivative action.
-        kd, kd_before = self.gains.per_lane("kd"), before.gains.per_lane("kd")
-        derivative = kd * np.divide(terms[TERMS.index("derivative")], kd_before, out=zeros, where=kd_before != 0)
+        law = self._law
         r, y = law.shaped(setpoint, output, self._shaping)
+        derivative = terms[TERMS.index("derivative")] * self._derivative_that_stays(before)
         e_d = law.derivative_error(r, y)
         back = np.divide(derivative, law.c[KD_H], out=np.zeros_like(e_d), where=law.c[KD_H] != 0)
         self._state[FILTER] = e_d - back
-        self._state[INTEGRAL] = law.integral(wanted - law.proportional(r, y) - derivative, self._state[INTEGRAL])
+        needed = effort - law.proportional(r, y) - derivative
+        if not before.operation.manual and before.limits == law.limits:
+            # Beyond a limit in force the effort has room: the integral action need not give way, nor need it wind up.
+            now, unlimited = self._state[INTEGRAL], terms[TERMS.index("unlimited_effort")]
+            needed = np.where(unlimited > effort, np.maximum(needed, now), needed)
+            needed = np.where(unlimited < effort, np.minimum(needed, now), needed)
+        self._state[INTEGRAL] = law.integral(needed, self._state[INTEGRAL])
+
+    def _derivative_that_stays(self, before: _Law) -> np.ndarray:
+        """How much of the derivative action the new law goes on with, (lanes,), 0 to 1.
+
+        With a smaller K_d less of it, or what the new, faster filter would drop at the next sample would be a late jump.
+        """
+        kd, kd_before = self.gains.per_lane("kd"), before.gains.per_lane("kd")
+        with np.errstate(over="ignore"):
+            share = np.divide(kd, kd_before, out=np.zeros(len(kd)), where=kd_before != 0)
+        return np.asarray(np.clip(share, 0.0, 1.0))
 
 
 class _Law:
@@ -249,6 +260,12 @@ class _Law:
             self._high.copy(),
         )
         return shaped
+
+    @property
+    def limits(self) -> tuple[object, ...]:
+        """All that bounds the effort."""
+        gains, operation = self.gains, self.operation
+        return gains.effort_min, gains.effort_max, operation.effort_rate
 
     def proportional(self, r: np.ndarray, y: np.ndarray) -> np.ndarray:
         """u_p (7)."""

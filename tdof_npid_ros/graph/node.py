@@ -40,7 +40,10 @@ DIAGNOSTICS_PERIOD = 1.0  # s
 REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
 LEAVE_TIMEOUT = 2.0  # s until a process ends that the middleware does not let go of
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
-OF_OTHER_NODES = ("sample_period", "mode", "speed")  # which a file may give to all nodes of a loop
+# Parameters that a file may give to all nodes of a loop, and to a node that needs only some of them.
+OF_OTHER_NODES = ("sample_period", "mode", "speed", "lanes", "joint_names", "lossless", "autostart",
+                  "deadline", "lease", "request_deadline", "priority", "cpu")  # fmt: skip
+PASSED_OVER = ("plan.", "qos_overrides.")
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -183,7 +186,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._defaults[name] = default
         descriptor = ParameterDescriptor(description=description, read_only=fixed, dynamic_typing=True)
         value = plain(self.declare_parameter(name, default, descriptor).value)
-        check_kind(name, as_float(value) if isinstance(first(default), float) else value, default)
+        if value is not None or not isinstance(default, list):  # ROS passes an empty list as nothing
+            check_kind(name, as_float(value) if isinstance(first(default), float) else value, default)
         return value
 
     def values_of(self, names: Sequence[str]) -> dict[str, Any]:
@@ -200,7 +204,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def _warn_of_unknown_parameters(self) -> None:
         """ROS passes over what a parameter file gives a node that does not know it, a misspelt gain for one."""
         for name in self._parameter_overrides:
-            if not self.has_parameter(name) and name not in OF_OTHER_NODES and not name.startswith("qos_overrides."):
+            if not self.has_parameter(name) and name not in OF_OTHER_NODES and not name.startswith(PASSED_OVER):
                 known = get_close_matches(name, self._defaults, 1)
                 hint = f": {known[0]} is meant?" if known else ""
                 self.get_logger().warning(f"parameter {name} is not one of this node's, and does nothing{hint}")
@@ -360,7 +364,7 @@ def as_float(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text, in quotes if it looks like a number"}
 
 
 def check_kind(name: str, value: Any, default: Any) -> None:
@@ -369,14 +373,10 @@ def check_kind(name: str, value: Any, default: Any) -> None:
     Raises:
         ValueError: it is.
     """
-    kind = type(first(default))
-    if value is None or (isinstance(default, list) and not isinstance(value, list)):
-        raise ValueError(f"{name} is {value!r}: it must be {'a list' if isinstance(default, list) else KINDS[kind]}")
-    if isinstance(value, list) and not isinstance(default, list) and kind is not float:
-        raise ValueError(f"{name} is {value!r}: it must be {KINDS[kind]}")
-    for one in value if isinstance(value, list) else [value]:
-        if type(one) is not kind:
-            raise ValueError(f"{name} is {value!r}: it must be {KINDS[kind]}")
+    kind, is_list = type(first(default)), isinstance(default, list)
+    many = isinstance(value, list) and (is_list or kind is float)
+    if (is_list and not many) or any(type(one) is not kind for one in (value if many else [value])):
+        raise ValueError(f"{name} is {value!r}: it must be {'a list, each of it ' if is_list else ''}{KINDS[kind]}")
 
 
 def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:

@@ -51,7 +51,7 @@ class ScenarioNode(LoopNode):
         self.accept_changes()
         self.played = 0
         self.reported_episode = 0  # by the plant
-        self.latest_episode = self.finished_before = 0  # of the plant, that was played to its end; and before `current`
+        self.finished = (0, "")  # the plant's latest episode, and its plan, that was played to its end
         self.plant_before: list[Parameter] = []  # in realtime: what the plan has changed of the plant, as it was
         self.queue: list[Plan] = []
         self.current: Plan | None = None
@@ -105,7 +105,7 @@ class ScenarioNode(LoopNode):
             self.publish_diagnostics()
             return
         self.current = self.queue.pop(0)
-        self.point, self.finished_before = -1, self.latest_episode
+        self.point = -1
         self.started_ns: int | None = None
         self.wait_until_ns = STEADY.now().nanoseconds + PLANT_TIMEOUT_NS
         if self.mode == "lockstep":
@@ -141,11 +141,13 @@ class ScenarioNode(LoopNode):
                 self.refuse("rejected", "diagnostics of the plant refused: its episode is no number")
                 continue
             if episode < self.reported_episode:  # the plant has been started again, and counts anew
-                self.latest_episode = self.finished_before = 0
+                self.finished = (0, "")
             self.reported_episode = episode
-            finished = facts.get("state") == "finished" and facts.get("plan") == getattr(self.current, "digest", None)
-            if self.mode == "lockstep" and self.current and finished and episode > self.finished_before:
-                self.latest_episode = episode
+            if self.mode != "lockstep" or self.current is None or facts.get("state") != "finished":
+                continue
+            report = (episode, self.current.digest)
+            if facts.get("plan") == self.current.digest and report != self.finished:
+                self.finished = report
                 self._advance_to(self.current.end_ns)
                 self._next()
 
@@ -174,8 +176,9 @@ class ScenarioNode(LoopNode):
             self.point += 1
             self._publish_signals(plan, self.point)
             if self.mode == "realtime":
-                row = zip(plan.names, plan.values[self.point], strict=True)
-                self._set_plant([_double(name, value) for name, value in row if name.startswith(PLANT)])
+                before = plan.values[self.point - 1] if self.point else [None] * len(plan.names)
+                row = zip(plan.names, before, plan.values[self.point], strict=True)
+                self._set_plant([_double(name, now) for name, was, now in row if name.startswith(PLANT) and now != was])
 
     def _publish_signals(self, plan: Plan, point: int) -> None:
         row = dict(zip(plan.names, plan.values[point], strict=True))
@@ -211,6 +214,7 @@ class ScenarioNode(LoopNode):
         def look(answer: Any) -> None:
             for parameter, result in zip(parameters, answer.result().results, strict=False):
                 if not result.successful:
+                    self.plant_before = [before for before in self.plant_before if before.name != parameter.name]
                     self.refuse("rejected", f"{PLANT}{parameter.name} was refused by the plant", f": {result.reason}")
 
         self.set_client.call_async(SetParameters.Request(parameters=parameters)).add_done_callback(look)

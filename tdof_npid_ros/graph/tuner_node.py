@@ -35,7 +35,7 @@ from tdof_npid_ros.graph.node import (
     number,
 )
 from tdof_npid_ros.output_file import check_writable
-from tdof_npid_ros.parameter_file import ParameterFileError, check_only_gains, write_parameters
+from tdof_npid_ros.parameter_file import ParameterFileError, check_replaceable, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -94,7 +94,7 @@ class TunerNode(LoopNode):
         self.stay = self.declare_value("stay", False, "stay on the graph when done, instead of ending", fixed=True)
         if self.result_file is not None:
             check_writable(self.result_file)
-            check_only_gains(self.result_file)
+            check_replaceable(self.result_file, "controller", Gains().as_dict())
         self.accept_changes()
         self.study = Study(self.problem, checkpoint, bool(resume))
         self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"

@@ -195,6 +195,14 @@ def test_a_first_stamp_of_0_is_no_part_of_what_follows(tmp_path) -> None:
     assert "recording #2: response to tracking: the setpoint is not in the bag" in analyze([tmp_path / "bag"]).table()
 
 
+def test_a_slow_loop_has_its_time(tmp_path) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        for k in range(20):
+            writer.write("joint_states", JOINT_STATE, joint_state(START_NS + k * 7200 * 10**9, "base_link", [1.0]))
+    (report,) = analyze([tmp_path / "bag"]).episodes
+    assert len(report.episode.time) == 20
+
+
 def test_stamps_that_fit_no_grid_are_refused(tmp_path) -> None:
     with LoopBag(tmp_path / "bag") as writer:
         for stamp in (1, 2, 3, 10**9):

@@ -92,6 +92,38 @@ def test_a_change_without_effect_has_none_at_a_limit(change: dict[str, Any]) -> 
     assert changed.run(500) == pytest.approx(unchanged.run(500), abs=1e-9)
 
 
+@pytest.mark.parametrize("anti_windup", ["none", "conditional", "back_calculation"])
+def test_a_smaller_gain_at_a_limit_does_not_wind_up(anti_windup: AntiWindup) -> None:
+    gains = Gains("pid", kp=50.0, ki=5.0, effort_min=-12.0, effort_max=12.0, anti_windup=anti_windup)
+    loop = Loop(gains, setpoint=10.0)
+    loop.run(50)
+    before = float(loop.controller.integral[0])
+    loop.change({"kp": 5.0})
+    loop.run(1)
+    needed = 12.0 - 5.0 * (10.0 - loop.y)
+    assert loop.controller.integral_before[0] <= max(before, needed) + 1.0
+
+
+def test_lifting_a_limit_or_a_rate_does_not_make_the_effort_jump() -> None:
+    for lift in ({"effort_rate": math.inf}, {"effort_max": math.inf}):
+        limited = {"effort_rate": 20.0} if "effort_rate" in lift else {}
+        most = 4.0 if "effort_max" in lift else math.inf
+        loop = Loop(Gains("pid", kp=50.0, ki=5.0, effort_max=most), Operation(**limited), setpoint=10.0)
+        before = loop.run(20)[-1]
+        gains = {name: value for name, value in lift.items() if name == "effort_max"}
+        loop.change(gains, **{name: value for name, value in lift.items() if name == "effort_rate"})
+        assert loop.run(1)[0] == pytest.approx(before, abs=0.5), lift
+
+
+def test_a_larger_derivative_gain_leaves_nothing_behind() -> None:
+    """A kick that the old filter holds must not be made larger, and taken back by the integral action."""
+    loop = Loop(Gains("pid", kp=2.0, ki=1.0, kd=0.1))
+    loop.run(500)
+    loop.setpoint = 2.0
+    loop.change({"kd": 0.5})
+    assert min(loop.run(50)) > 0.0
+
+
 def test_without_integral_action_there_is_nothing_to_track() -> None:
     gains = Gains("pid", kp=5.0, ki=0.0, effort_min=-1.0, effort_max=1.0)
     tracking, plain = Loop(gains.with_values(anti_windup="back_calculation", tracking_time=1.0)), Loop(gains)

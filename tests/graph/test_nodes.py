@@ -234,7 +234,7 @@ def test_bad_start_parameters_are_one_line_and_status_2(
 
 
 def test_a_misspelt_parameter_is_warned_of(graph: Any) -> None:
-    plant = graph.start("plant", gian=2.0, sample_period=0.01)
+    plant = graph.start("plant", gian=2.0, sample_period=0.01, joint_names=[""], plan__setpoint=["1 end"])
     graph.wait_for_nodes("/plant")
     assert "parameter gian is not one of this node's, and does nothing: gain is meant?" in plant.log
     assert plant.log.count("not one of this node's") == 1

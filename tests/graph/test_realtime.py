@@ -60,13 +60,14 @@ def test_in_realtime_each_episode_begins_with_the_configured_plant(graph: Any) -
     scenario = graph.start(
         "scenario",
         episodes=["a", "b"],
-        plan__a=["0 plant.gain 3", "0 plant.dead_time 2", "10 end"],
+        plan__a=["0 plant.gain 3", "0 plant.dead_time 2", "30 end"],
         plan__b=["0 setpoint 1", "50 end"],
         **quick,
     )
     graph.wait_until(lambda: graph.get_parameters("/plant", "gain") == [3.0], what="the change that the plan makes")
     graph.wait_until(lambda: graph.get_parameters("/plant", "gain") == [1.5], what="the gain as it was")
     graph.wait_for_log(scenario, "plant.dead_time was refused by the plant")
+    assert graph.fresh_fact("/scenario", "rejected") == "1"
 
 
 def test_soak_at_200_hz(graph: Any) -> None:

@@ -139,8 +139,11 @@ def test_gains_replace_nothing_but_gains(tmp_path: Path, capsys: pytest.CaptureF
     capsys.readouterr()
     write_parameters(out, {"controller": {"kp": 1.0}, "plant": {"gain": 2.0}})
     before = out.read_bytes()
-    assert "holds more than a controller's gains" in refused(capsys, *QUICK, "--controller", "pid", "--out", str(out))
+    assert "holds more than such a result" in refused(capsys, *QUICK, "--controller", "pid", "--out", str(out))
     assert out.read_bytes() == before
+    for text in ("/**/controller: {ros__parameters: {kp: 1.0, joint_names: [a]}}", "# mine\n/**/controller: {}"):
+        out.write_text(text)
+        assert "holds more than such a result" in refused(capsys, *QUICK, "--controller", "pid", "--out", str(out))
 
 
 def test_bounds_that_no_controller_takes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
