@@ -19,6 +19,7 @@ from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNo
 from tdof_npid_ros.scenario import Plan, parse_plan
 
 PLANT = "plant."  # what begins the name of a plant's parameter in a plan
+ASK_AGAIN_NS = 300_000_000  # an answer is lost if the plant has not found this node yet
 PLANT_TIMEOUT_NS = 3_000_000_000  # in realtime, an episode waits so long for a plant that can be reset
 
 
@@ -53,6 +54,9 @@ class ScenarioNode(LoopNode):
         self.reported_episode = 0  # by the plant
         self.finished = (0, "")  # the plant's latest episode, and its plan, that was played to its end
         self.plant_before: list[Parameter] = []  # in realtime: what the plan has changed of the plant, as it was
+        self.restored: Any = None  # the future of the plant's answer to that
+        self.told: Any = None  # and of the one to what it is before,
+        self.asked_ns = 0  # and when that was asked for
         self.queue: list[Plan] = []
         self.current: Plan | None = None
 
@@ -121,7 +125,6 @@ class ScenarioNode(LoopNode):
             self.reset_client.call_async(Trigger.Request())
         else:
             self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
-        self._remember_plant([name for name in plan.names if name.startswith(PLANT)])
         self.started_ns = STEADY.now().nanoseconds
         self._publish_plan(plan)
 
@@ -159,7 +162,8 @@ class ScenarioNode(LoopNode):
             return
         now = STEADY.now().nanoseconds
         if self.started_ns is None:
-            if self.reset_client.service_is_ready() or now > self.wait_until_ns:
+            is_there = self.reset_client.service_is_ready() or now > self.wait_until_ns
+            if is_there and self._knows_plant(self.current, now):
                 self._begin(self.current)
             return
         now = int((now - self.started_ns) * self.speed)
@@ -190,26 +194,32 @@ class ScenarioNode(LoopNode):
             setattr(message, field, [row.get(name, 0.0)])
             publisher.publish(message)
 
-    def _remember_plant(self, names: list[str]) -> None:
-        """Ask what the plan will change, before it does: the next episode begins with what was configured."""
+    def _knows_plant(self, plan: Plan, now: int) -> bool:
+        """Whether the plant is as configured, and has told what that is, so that it can be so for the next episode."""
+        if self.restored is not None and not self.restored.done() and now < self.wait_until_ns:
+            return False
+        names = [name.removeprefix(PLANT) for name in plan.names if name.startswith(PLANT)]
         if not names:
-            return
-
-        def remember(answer: Any) -> None:
-            values = answer.result().values
-            found = [Parameter(name=n, value=v) for n, v in zip(request.names, values, strict=False)]
-            self.plant_before = [parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET]
-
-        request = GetParameters.Request(names=[name.removeprefix(PLANT) for name in names])
-        self.get_client.call_async(request).add_done_callback(remember)
+            return True
+        if self.told is None or not self.told.done():
+            if self.get_client.service_is_ready() and now - self.asked_ns > ASK_AGAIN_NS:
+                if self.told is None:
+                    self.wait_until_ns = now + PLANT_TIMEOUT_NS
+                self.told, self.asked_ns = self.get_client.call_async(GetParameters.Request(names=names)), now
+            return bool(now > self.wait_until_ns)
+        values = self.told.result().values
+        found = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=False)]
+        self.plant_before = [parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET]
+        return True
 
     def _restore_plant(self) -> None:
         before, self.plant_before = self.plant_before, []
-        self._set_plant(before)
+        self.restored, self.told, self.asked_ns = self._set_plant(before), None, 0
 
-    def _set_plant(self, parameters: list[Parameter]) -> None:
+    def _set_plant(self, parameters: list[Parameter]) -> Any:
+        """Set them; returns the future of the plant's answer, None if there are none."""
         if not parameters:
-            return
+            return None
 
         def look(answer: Any) -> None:
             for parameter, result in zip(parameters, answer.result().results, strict=False):
@@ -217,7 +227,9 @@ class ScenarioNode(LoopNode):
                     self.plant_before = [before for before in self.plant_before if before.name != parameter.name]
                     self.refuse("rejected", f"{PLANT}{parameter.name} was refused by the plant", f": {result.reason}")
 
-        self.set_client.call_async(SetParameters.Request(parameters=parameters)).add_done_callback(look)
+        future = self.set_client.call_async(SetParameters.Request(parameters=parameters))
+        future.add_done_callback(look)
+        return future
 
     # Parameters and state
 
