@@ -11,7 +11,7 @@ ROOM = 65536  # bytes: more than a result or a checkpoint of any population take
 
 
 class OutputError(ValueError):
-    """A file that cannot be written, or would be lost. The message is one line: which, why."""
+    """A file or folder that must not or cannot be written. The message is one line: which, why."""
 
 
 def check_outputs(outputs: Sequence[Path], inputs: Sequence[Path] = ()) -> None:

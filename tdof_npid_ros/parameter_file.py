@@ -36,9 +36,8 @@ def check_replaceable(path: Path, node: str, names: Collection[str]) -> None:
     """
     if not path.is_file() or not path.stat().st_size:
         return
-    document = _load(path)
-    values = document.get(f"/**/{node}", {}).get("ros__parameters", {})
-    if set(document) != {f"/**/{node}"} or not set(values) <= set(names) or path.read_text("utf-8") != _text(document):
+    values = read_parameters(path, node)
+    if not set(values) <= set(names) or path.read_text("utf-8") != _text({node: values}):
         raise ParameterFileError(f"{path} holds more than such a result, which would be lost: give another file")
 
 
@@ -48,14 +47,14 @@ def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:
     Raises:
         ParameterFileError: the file cannot be written.
     """
-    document = {f"/**/{node}": {"ros__parameters": values} for node, values in nodes.items()}
     try:
-        path.write_text(_text(document), encoding="utf-8")
+        path.write_text(_text(nodes), encoding="utf-8")
     except OSError as error:
         raise ParameterFileError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _text(document: dict[str, Any]) -> str:
+def _text(nodes: dict[str, dict[str, Any]]) -> str:
+    document = {f"/**/{node}": {"ros__parameters": values} for node, values in nodes.items()}
     return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True))
 
 

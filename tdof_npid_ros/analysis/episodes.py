@@ -16,11 +16,10 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.stamps import RESTART_NS
-from tdof_npid_ros.scenario import Plan, episode_named, parse_plan
+from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, episode_named, parse_plan
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
 LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
-MOST_SAMPLES = 10_000_000  # of an episode without a plan, as plans have at most
 UNPLANNED = "recording"  # the name of an episode without a plan
 
 
@@ -230,10 +229,10 @@ def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np
     """Stamps k·h, of the whole plan or from the first output to the last."""
     if plan is not None:
         return np.arange(plan.steps(period_ns) + 1, dtype=np.int64) * period_ns
-    if (stamps[-1] - stamps[0]) // period_ns > MOST_SAMPLES:
+    if (stamps[-1] - stamps[0]) // period_ns > LARGEST_PLAN:
         raise AnalysisError(
             f"{bag}: outputs stamped from {stamps[0] / 1e9:.9g} to {stamps[-1] / 1e9:.9g} s, mostly {period_ns} ns apart, "
-            f"are more than {MOST_SAMPLES:,} sample periods: analyse a shorter or more regular recording"
+            f"are more than {LARGEST_PLAN:,} sample periods: analyse a shorter or more regular recording"
         )
     return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)
 

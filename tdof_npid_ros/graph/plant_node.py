@@ -117,14 +117,15 @@ class PlantNode(LoopEnd):
         Raises:
             PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
         """
-        changeable = changeable_parameters(self.model, self.values_of(self.model_names))
+        values = self.values_of(self.model_names)
+        changeable = changeable_parameters(self.model, values)
         for name in changes:
             if name not in changeable:
                 raise PlantError(
                     f"plant.{name} cannot change while the loop runs: with model {self.model} these can: "
                     f"{', '.join(changeable) or 'none'}"
                 )
-        return make_plant(self.model, {**self.values_of(self.model_names), **changes})
+        return make_plant(self.model, {**values, **changes})
 
     def new_simulator(self) -> PlantSimulator:
         """The plant at its initial state, with the parameters as they are now."""

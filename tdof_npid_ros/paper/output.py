@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tdof_npid_ros.output_file import OutputError
+
 MARKER = ".tdof-npid"
-
-
-class OutputError(ValueError):
-    """A folder that must not or cannot be written; the message says why."""
 
 
 def claim_folder(folder: Path, subcommand: str) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE
+from tdof_npid_ros.output_file import OutputError
 from tdof_npid_ros.paper.conclusions import (
     NO,
     WITH_SIGMA,
@@ -25,7 +26,7 @@ from tdof_npid_ros.paper.conclusions import (
 from tdof_npid_ros.paper.evaluation import CASE_TITLES, CONTROLLER_TITLES, Measured, Rows, evaluate_row
 from tdof_npid_ros.paper.findings import findings
 from tdof_npid_ros.paper.items import ITEMS, Evaluated
-from tdof_npid_ros.paper.output import OutputError, claim_folder
+from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
 from tdof_npid_ros.paper.report import Figure, Finding, Table
 from tdof_npid_ros.paper.tables import COMPARED, ROWS
