@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,6 +25,7 @@ from tdof_npid_ros.control.gains import (
 from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
+from tdof_npid_ros.parameter_names import OF_NODE, unknown_parameters
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.scenario import Plan, PlanError, Signals, parse_plan
@@ -184,15 +186,14 @@ def sample_period_in_ns(value: Any) -> int:
 
 
 def load_case(name: str | Path) -> Case:
-    """A case by its name (`p1-c0.5`) or by the path of its parameter file.
+    """A case by its name (`p1-c0.5`) or by the path of its parameter file; misspelt parameters are warned of.
 
     Raises:
         ParameterFileError, PlantError, PlanError, GainsError: the file is missing or something in it is wrong.
     """
     path = find_parameter_file(name)
-    plant, controller, scenario, tuner = (
-        read_parameters(path, n) for n in ("plant", "controller", "scenario", "tuner")
-    )
+    nodes = {node: read_parameters(path, node) for node in ("plant", "controller", "scenario", "tuner")}
+    plant, controller, scenario, tuner = nodes.values()
     periods = {
         node: values["sample_period"]
         for node, values in (("plant", plant), ("controller", controller), ("scenario", scenario))
@@ -217,6 +218,10 @@ def load_case(name: str | Path) -> Case:
         _ = case.plant, case.plans
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
+    for node, values in nodes.items():
+        known = (*OF_NODE[node], *(model_parameters(case.model) if node == "plant" else ()))
+        for warning in unknown_parameters(values, known):
+            warnings.warn(f"{path}: {node}: {warning}", stacklevel=2)
     return case
 
 

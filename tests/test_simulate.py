@@ -64,6 +64,23 @@ def test_gains_come_from_a_parameter_file(capsys: pytest.CaptureFixture[str], tm
     assert "no parameters of a controller in it" in capsys.readouterr().err
 
 
+def test_misspelt_parameters_are_warned_of(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    text = (config_folder() / "p1-c4.yaml").read_text()
+    file.write_text(text.replace("time_constant:", "tau: 3.0\n    time_constnt:").replace("weight:", "wieght:"))
+    with pytest.warns(UserWarning) as warned:
+        load_case(file)
+    nothing = "is not one of this node's, and does nothing"
+    assert [str(each.message) for each in warned] == [
+        f"{file}: plant: parameter tau {nothing}",
+        f"{file}: plant: parameter time_constnt {nothing}: time_constant is meant?",
+        f"{file}: tuner: parameter wieght {nothing}: weight is meant?",
+    ]
+    program = Path(sys.executable).parent / "tdof-npid"
+    printed = subprocess.run([program, "simulate", file], capture_output=True, text=True, check=True).stderr
+    assert printed.splitlines() == [f"tdof-npid: {each.message}" for each in warned]
+
+
 def test_a_folder_does_not_hide_a_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -81,4 +82,5 @@ def _one_line(error: Exception) -> str:
 
 def entry() -> None:
     """The console script."""
+    warnings.formatwarning = lambda message, *_, **__: f"tdof-npid: {message}\n"  # in one line, as errors are
     sys.exit(main())

@@ -11,7 +11,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from typing import Any
 
 import rclpy
@@ -30,6 +29,7 @@ from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.messages import diagnostics_message
 from tdof_npid_ros.graph.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.timing import collect_garbage
+from tdof_npid_ros.parameter_names import unknown_parameters
 from tdof_npid_ros.signals import Sample, SignalReader
 
 SIGNAL_QOS = signal_qos(1000)
@@ -40,10 +40,6 @@ DIAGNOSTICS_PERIOD = 1.0  # s
 REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
 LEAVE_TIMEOUT = 2.0  # s until a process ends that the middleware does not let go of
 SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
-# Parameters that a file may give to all nodes of a loop, and to a node that needs only some of them.
-OF_OTHER_NODES = ("sample_period", "mode", "speed", "lanes", "joint_names", "lossless", "autostart",
-                  "deadline", "lease", "request_deadline", "priority", "cpu")  # fmt: skip
-PASSED_OVER = ("plan.", "qos_overrides.")
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -203,11 +199,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     def _warn_of_unknown_parameters(self) -> None:
         """ROS passes over what a parameter file gives a node that does not know it, a misspelt gain for one."""
-        for name in self._parameter_overrides:
-            if not self.has_parameter(name) and name not in OF_OTHER_NODES and not name.startswith(PASSED_OVER):
-                known = get_close_matches(name, self._defaults, 1)
-                hint = f": {known[0]} is meant?" if known else ""
-                self.get_logger().warning(f"parameter {name} is not one of this node's, and does nothing{hint}")
+        given = (name for name in self._parameter_overrides if not self.has_parameter(name))
+        for warning in unknown_parameters(given, self._defaults):
+            self.get_logger().warning(warning)
 
     def _as_declared(self, parameters: list[Parameter]) -> list[Parameter]:
         """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send."""

@@ -16,6 +16,8 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.parameter_names import OF_ANY_NODE, OF_NODE, WITH_ANY_END
+from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import parse_plan
 
 AT_ONCE = 2.5  # s; some 0.3 s on a quiet machine
@@ -238,6 +240,21 @@ def test_a_misspelt_parameter_is_warned_of(graph: Any) -> None:
     graph.wait_for_nodes("/plant")
     assert "parameter gian is not one of this node's, and does nothing: gain is meant?" in plant.log
     assert plant.log.count("not one of this node's") == 1
+
+
+def test_the_names_that_no_node_warns_of_are_the_parameters_that_the_nodes_have(graph: Any) -> None:
+    from rcl_interfaces.srv import ListParameters
+
+    seen: set[str] = set()
+    for node, its in OF_NODE.items():
+        graph.start(node, *(["-p", "case:=p1-c4"] if node == "tuner" else []), autostart=False)
+        graph.wait_for_nodes(f"/{node}")
+        listed = graph.call(f"/{node}/list_parameters", ListParameters, ListParameters.Request(), again=True)
+        names = {name for name in listed.result.names if not name.startswith(WITH_ANY_END)}
+        model = set(model_parameters("first_order")) if node == "plant" else set()
+        assert names - set(OF_ANY_NODE) == set(its) | model
+        seen |= names
+    assert seen >= set(OF_ANY_NODE)
 
 
 def test_what_a_plant_cannot_do_is_refused_and_it_goes_on(graph: Any) -> None:
