@@ -53,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if (error.name or "").partition(".")[0] != "rclpy":
             raise
         print(
-            f"tdof-npid {name}: needs ROS 2: source an installed one, or pip install 'tdof_npid_ros[ros]'",
+            f"tdof-npid {name}: needs ROS 2: source an installed one, or "
+            "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces",
             file=sys.stderr,
         )
         return USAGE_ERROR

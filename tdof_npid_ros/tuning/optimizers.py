@@ -120,7 +120,7 @@ class Cmaes(_Replayed):
         try:
             import cma
         except ImportError:
-            raise TuningError("cmaes needs cma: pip install 'tdof_npid_ros[paper]', or pip install cma") from None
+            raise TuningError("cmaes needs cma: pip install cma") from None
 
         self._restarts += 1
         options = {

@@ -186,4 +186,4 @@ def check_installed() -> None:
     try:
         importlib.import_module(PYMOO_NSGA2)
     except ImportError:
-        raise TuningError("NSGA-II needs pymoo: pip install 'tdof_npid_ros[paper]', or pip install pymoo") from None
+        raise TuningError("NSGA-II needs pymoo: pip install pymoo") from None
