@@ -405,7 +405,7 @@ def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = No
         if node is not None:
             _end(node, status)
         rclpy.try_shutdown()
-        stop.ignore_further()
+        ignore_further_signals()
     sys.exit(status)
 
 
@@ -466,14 +466,15 @@ class Stop:
         if wake is not None:
             wake()
 
-    def ignore_further(self) -> None:
-        """For the end of the process, also while the interpreter shuts down."""
-        for number_ in STOP_SIGNALS:
-            signal.signal(number_, signal.SIG_IGN)
-
     def wakes(self, executor: Any | None) -> None:
         """Wake this executor, or none, when the signal comes."""
         self._wake = executor and executor.wake
+
+
+def ignore_further_signals() -> None:
+    """For the end of the process, also while the interpreter shuts down."""
+    for each in STOP_SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
 
 
 def spin(node: LoopNode, stop: Stop | None = None) -> None:

@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 import threading
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -32,6 +33,7 @@ from tdof_npid_ros.graph.node import (
     LoopNode,
     autostart,
     executor_for,
+    ignore_further_signals,
     number,
 )
 from tdof_npid_ros.output_file import check_writable
@@ -149,7 +151,11 @@ class TunerNode(LoopNode):
         name = str(self.declare_value("case", "", "case to tune (p1-c0.5, …), or its parameter file", fixed=True))
         if not name:
             raise ParameterFileError("the tuner needs its parameter case: a case's name or its parameter file")
-        case = load_case(name)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            case = load_case(name)
+        for warning in told:
+            self.get_logger().warning(str(warning.message))
         bounds = {
             gain: read_bounds(
                 gain, self.declare_value(f"bounds.{gain}", list(its), f"[lower, upper] of {gain}", fixed=True)
@@ -303,6 +309,7 @@ def main(args: list[str] | None = None) -> None:
         print(f"tuner: {error}", file=sys.stderr)
         status = FAILURE
     rclpy.try_shutdown()
+    ignore_further_signals()
     sys.exit(status)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import config_folder, load_case
 from tdof_npid_ros.control.operation import Operation
 from tdof_npid_ros.parameter_names import OF_ANY_NODE, OF_NODE, WITH_ANY_END
 from tdof_npid_ros.plants.catalog import model_parameters
@@ -116,6 +116,16 @@ def test_ctrl_c_again_and_again_while_it_is_loaded(graph: Any) -> None:
         process.send(signal.SIGINT)
         graph.spin_once(0.01)
     assert (process.process.returncode, process.log) == (0, "")
+
+
+def test_ctrl_c_again_and_again_while_a_tuner_ends(graph: Any) -> None:
+    process = graph.start("tuner", "-p", "case:=p1-c0.5")
+    graph.wait_for_log(process, "tuning")
+    process.stopped = True
+    while process.process.poll() is None:
+        process.send(signal.SIGINT)
+        graph.spin_once(0.01)
+    assert process.process.returncode == 0, process.log
 
 
 OUTLIVED = """
@@ -235,11 +245,16 @@ def test_bad_start_parameters_are_one_line_and_status_2(
     assert len(lines) == 1 and reason in lines[0], process.log
 
 
-def test_a_misspelt_parameter_is_warned_of(graph: Any) -> None:
+def test_a_misspelt_parameter_is_warned_of(graph: Any, tmp_path: Path) -> None:
     plant = graph.start("plant", gian=2.0, sample_period=0.01, joint_names=[""], plan__setpoint=["1 end"])
     graph.wait_for_nodes("/plant")
     assert "parameter gian is not one of this node's, and does nothing: gain is meant?" in plant.log
     assert plant.log.count("not one of this node's") == 1
+    case = tmp_path / "mine.yaml"
+    case.write_text((config_folder() / "p1-c4.yaml").read_text().replace("weight:", "wieght:"))
+    tuner = graph.start("tuner", "-p", f"case:={case}", autostart=False)
+    warning = "mine.yaml: tuner: parameter wieght is not one of this node's, and does nothing: weight is meant?"
+    graph.wait_for_log(tuner, warning)
 
 
 def test_the_names_that_no_node_warns_of_are_the_parameters_that_the_nodes_have(graph: Any) -> None:
