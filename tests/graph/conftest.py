@@ -160,6 +160,21 @@ class Graph:
 
     # Nodes
 
+    @contextmanager
+    def newcomer(self) -> Iterator[Any]:
+        """A further onlooker, which is told how the domain is now, not what has happened in it."""
+        import rclpy
+
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=self.domain)
+        node = rclpy.create_node("newcomer", context=context)
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+            context.shutdown()
+            context.destroy()
+
     def start(self, node: str, *arguments: str, case: str = "", namespace: str = "", **parameters: Any) -> NodeProcess:
         """Start a node.
 

@@ -132,24 +132,28 @@ OUTLIVED = """
 import rclpy
 from tdof_npid_ros.graph.plant_node import PlantNode
 rclpy.init()
+stays = rclpy.create_node("stays")
 node = PlantNode()
 node.trigger_configure()
 node.trigger_activate()
 input()
 node.destroy_node()
+print("destroyed", flush=True)
 input()
 """
 
 
 def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) -> None:
     command = [sys.executable, "-c", OUTLIVED]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, env=graph.environment, text=True) as process:
-        assert process.stdin is not None
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, env=graph.environment, text=True) as process:  # type: ignore[call-overload]
         graph.wait_until(lambda: "plant" in graph.node.get_node_names(), 60, "the plant")
         process.stdin.write("\n")
         process.stdin.flush()
-        graph.wait_until(lambda: "plant" not in graph.node.get_node_names(), 30, "the plant's leaving")
-        assert process.poll() is None
+        assert process.stdout.readline() == "destroyed\n"
+        with graph.newcomer() as newcomer:
+            left = {"stays"}
+            graph.wait_until(lambda: {"stays", "plant"} & set(newcomer.get_node_names()) == left, 30, "the plant's leaving")
         process.communicate("\n", timeout=30)
     assert process.returncode == 0
 
