@@ -215,11 +215,13 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
 
     graph.start("controller")
     plan = load_case("p1-c0.5").plans["setpoint"]
-    graph.publisher("scenario_plan", JointTrajectory, LATCHED_QOS).publish(plan_message(plan, 0))
+    plans = graph.publisher("scenario_plan", JointTrajectory, LATCHED_QOS)
     output = JointState(position=[0.25])
     output.header.frame_id = f"{plan.digest}/1"
     graph.publisher("output", JointState).publish(output)
-    graph.wait_until(lambda: graph.fact("/controller", "steps") == "1", what="an answer that nobody hears")
+    graph.publish_until(
+        plans, plan_message(plan, 0), lambda: graph.fact("/controller", "steps") == "1", what="an answer that nobody hears"
+    )
     efforts = graph.collect("control_effort", JointState)
     graph.wait_until(lambda: efforts, what="the same answer")
     assert efforts[0].header.frame_id.endswith(output.header.frame_id)
