@@ -144,9 +144,14 @@ input()
 
 
 def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) -> None:
-    command = [sys.executable, "-c", OUTLIVED]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes, env=graph.environment, text=True) as process:  # type: ignore[call-overload]
+    with subprocess.Popen(
+        [sys.executable, "-c", OUTLIVED],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=graph.environment,
+        text=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
         graph.wait_until(lambda: "plant" in graph.node.get_node_names(), 60, "the plant")
         process.stdin.write("\n")
         process.stdin.flush()
@@ -154,6 +159,7 @@ def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) 
         with graph.newcomer() as newcomer:
             left = {"stays"}
             graph.wait_until(lambda: {"stays", "plant"} & set(newcomer.get_node_names()) == left, 30, "the plant's leaving")
+        assert process.poll() is None
         process.communicate("\n", timeout=30)
     assert process.returncode == 0
 
