@@ -9,7 +9,8 @@ NAME = "tdof_npid_ros"
 NODES = ["plant", "controller", "scenario", "tuner", "recorder", "replay"]
 
 # `ros2 run` finds a node by the name of its executable in lib/tdof_npid_ros, where colcon puts it. Under pip such
-# executables would land in bin/, where names like `plant` belong to nobody: there, `python -m tdof_npid_ros.graph plant`.
+# executables would land in bin/, where names like `plant` belong to nobody: there, `python -m tdof_npid_ros.graph
+# plant`.
 by_colcon = "install" in sys.argv or "develop" in sys.argv
 node_scripts = [f"{node} = {NAME}.graph.__main__:{node}" for node in NODES] if by_colcon else []
 

@@ -1,4 +1,5 @@
-"""A bare rclpy node with one steady timer: `python -m benchmarks.bare_timer PERIOD SECONDS` prints p50 and p99 in us."""
+"""A bare rclpy node with one steady timer: `python -m benchmarks.bare_timer PERIOD SECONDS` prints p50 and p99 in
+us."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ def run(period: float, seconds: float) -> None:
     import rclpy
     from rclpy.clock import Clock, ClockType
 
-    from tdof_npid_ros.graph.node import fastest_executor
+    from tdof_npid_ros.graph.runtime.node import fastest_executor
 
     rclpy.init()
     node = rclpy.create_node("bare_timer")

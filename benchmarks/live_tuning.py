@@ -20,8 +20,10 @@ METHOD = (
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
-    "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second bound it. "
-    "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages the run took "
+    "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second "
+    "bound it. "
+    "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages the "
+    "run took "
     "121 s.",
 )
 

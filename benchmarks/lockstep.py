@@ -12,20 +12,27 @@ from benchmarks.recorder import run_loop
 TITLE = "Lockstep over DDS"
 METHOD = (
     "Steps per second of one episode of Process 1 with plant and controller as two processes, after a "
-    "short one (the ping-pong, too, is timed once the two have met), by the plant's reports; recorded: with the recorder "
-    "as a third, writing every topic. Beside it two bare rclpy processes that send the same message, as long as the loop's, "
-    "to and fro, one at a time. They run with rclpy's default executor and with its events executor, and the faster counts. "
+    "short one (the ping-pong, too, is timed once the two have met), by the plant's reports; recorded: with the "
+    "recorder "
+    "as a third, writing every topic. Beside it two bare rclpy processes that send the same message, as long as the "
+    "loop's, "
+    "to and fro, one at a time. They run with rclpy's default executor and with its events executor, and the faster "
+    "counts. "
     "*Unread*: they hand on the bytes "
     "of the message without reading them, the limit of any loop over rclpy. In turn, round by round."
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
-    "The loop reads and writes JointStates as bytes: rclpy's message takes longer to build and to take apart than a step of "
-    "plant and controller. The nodes' Fast DDS profile has no timer's thread wake at every message (nackSupressionDuration of "
+    "The loop reads and writes JointStates as bytes: rclpy's message takes longer to build and to take apart than a "
+    "step of "
+    "plant and controller. The nodes' Fast DDS profile has no timer's thread wake at every message "
+    "(nackSupressionDuration of "
     "5 ms, 8 % more steps/s). Answers are published before all bookkeeping.",
-    "What bounds it: DDS and the waking of the other process, as the unread ping-pong shows; plant and controller take the "
+    "What bounds it: DDS and the waking of the other process, as the unread ping-pong shows; plant and controller "
+    "take the "
     "rest. Tried without a measurable gain: shared memory (the "
-    "nodes use UDP, for its safe restarts; the ping-pong has both), no piggybacked heartbeats, `spin_until_future_complete` "
+    "nodes use UDP, for its safe restarts; the ping-pong has both), no piggybacked heartbeats, "
+    "`spin_until_future_complete` "
     "in place of `spin_once`. "
     "A second message on its way would hide the latency, but a loop has only one.",
 )

@@ -18,32 +18,46 @@ from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import coefficients, limits_of
 from tdof_npid_ros.loop import integrals, simulate
-from tdof_npid_ros.scenario import Signals, parse_plan
+from tdof_npid_ros.scenario import SampledPlan, parse_plan
 
 TITLE = "Closed-loop steps per second"
 METHOD = (
-    "One *step* is one sample of controller and plant. The loop is the paper's under TDOF-NPID2 at the published gains, "
-    "a unit step of the setpoint, back and forth as often as the case's episodes begin (in a loop at rest the C library's "
-    "exponential of next to nothing costs nothing); the call is `loop.integrals`, which the tuner makes. The picture and "
-    "the peers are Process 1 with c = 0.5. C is `benchmarks/loop.c`, -O3 -march=native, compiled for the number of plant "
+    "One *step* is one sample of controller and plant. The loop is the paper's under TDOF-NPID2 at the published "
+    "gains, "
+    "a unit step of the setpoint, back and forth as often as the case's episodes begin (in a loop at rest the C "
+    "library's "
+    "exponential of next to nothing costs nothing); the call is `loop.integrals`, which the tuner makes. The picture "
+    "and "
+    "the peers are Process 1 with c = 0.5. C is `benchmarks/loop.c`, -O3 -march=native, compiled for the number of "
+    "plant "
     "states as Numba compiles ours, no -ffast-math as ours has none; it is built with the C library's exponential and "
-    "with ours, and the faster build counts. It is one lane; with as many lanes as ours, in gcc's vectors, it is measured, "
-    "too. python-control runs the whole loop as one discrete `nlsys` through `input_output_response`, which is several times "
-    "faster than interconnected systems; bdsim (graphics and progress off) as one clocked state and one function; both step "
-    "the same vector, dead time included, by the same NumPy function. SciPy's `solve_ivp` is called each sample with the "
+    "with ours, and the faster build counts. It is one lane; with as many lanes as ours, in gcc's vectors, it is "
+    "measured, "
+    "too. python-control runs the whole loop as one discrete `nlsys` through `input_output_response`, which is "
+    "several times "
+    "faster than interconnected systems; bdsim (graphics and progress off) as one clocked state and one function; "
+    "both step "
+    "the same vector, dead time included, by the same NumPy function. SciPy's `solve_ivp` is called each sample with "
+    "the "
     "effort held and first_step = h, so that one Runge-Kutta step is enough. simple-pid is its own linear PID around a "
     "plant in NumPy. Each but simple-pid gives our output within 1e-6, checked in the run."
 )
 PEERS = ("control", "simple-pid", "bdsim")
 NOTES = (
-    "One lane against C: both are bound by the number of instructions, some 100 a step. The C library's exponential looks up "
-    "a table and costs fewer of them than our polynomial, and next to none in a loop at rest, where C is then a quarter "
+    "One lane against C: both are bound by the number of instructions, some 100 a step. The C library's exponential "
+    "looks up "
+    "a table and costs fewer of them than our polynomial, and next to none in a loop at rest, where C is then a "
+    "quarter "
     "faster than ours. We do not take it: its last bit differs from processor to processor, so that two hosts would "
     "disagree, and it cannot be computed for many lanes at once.",
-    "With 64 lanes gcc vectorises C, too, and stays ahead of ours by an eighth. Half of that are multiplications fused with "
-    "additions, gcc's default (968 million steps/s against 902 with -ffp-contract=off): ours are fused only where it is "
-    "written out, so that every processor gives the same bits. The rest are copies of the dead time's rows and constants "
-    "that LLVM loads anew for each vector. Copying in vectors and beginning rows at cache lines made ours a fifth faster.",
+    "With 64 lanes gcc vectorises C, too, and stays ahead of ours by an eighth. Half of that are multiplications "
+    "fused with "
+    "additions, gcc's default (968 million steps/s against 902 with -ffp-contract=off): ours are fused only where it "
+    "is "
+    "written out, so that every processor gives the same bits. The rest are copies of the dead time's rows and "
+    "constants "
+    "that LLVM loads anew for each vector. Copying in vectors and beginning rows at cache lines made ours a fifth "
+    "faster.",
     "Process 3 has no dead time, so that each step waits for the one before: latency bounds it, in C as here.",
 )
 
@@ -108,7 +122,14 @@ def _against_c(result: Result, per_case: dict[str, tuple[Rate, Rate, dict[str, R
         + [f"{same[name]:.2f}", f"{many[name]:.1f}"]
         for name, (scalar, lanes, c) in per_case.items()
     ]
-    header = ["case", "1 lane", f"{MANY} lanes", *(f"C, {build}" for build in builds), "1 lane / C", f"{MANY} lanes / C"]
+    header = [
+        "case",
+        "1 lane",
+        f"{MANY} lanes",
+        *(f"C, {build}" for build in builds),
+        "1 lane / C",
+        f"{MANY} lanes / C",
+    ]
     result.tables.append(Table("Million steps per second on one core, each linear case", header, rows))
     least, least_many = min(same, key=lambda name: same[name]), min(many, key=lambda name: many[name])
     result.verdicts += [
@@ -123,7 +144,7 @@ def _against_c(result: Result, per_case: dict[str, tuple[Rate, Rate, dict[str, R
     ]
 
 
-def _signals(case: Case, steps: int) -> Signals:
+def _signals(case: Case, steps: int) -> SampledPlan:
     """A unit step of the setpoint, back after the length of the case's setpoint episode, and so on."""
     period_ns, every_ns = case.sample_period_ns, case.plans["setpoint"].end_ns
     changes = [f"{k * every_ns / 1e9} setpoint {1 - k % 2}" for k in range(1 + (steps * period_ns - 1) // every_ns)]
@@ -166,7 +187,8 @@ def _c(case: Case, steps: int, repeats: int, lanes: int = 1) -> dict[str, Rate]:
     plant: Any = case.plant.sampled(case.sample_period_ns)
     c, limits = coefficients(case.gains, case.sample_period), limits_of(case.gains)
     numbers = [
-        signals.steps, C_RUNS, case.plans["setpoint"].end_ns // case.sample_period_ns, plant.delay, *np.ravel(plant.phi),
+        signals.steps, C_RUNS, case.plans["setpoint"].end_ns // case.sample_period_ns, plant.delay,
+        *np.ravel(plant.phi),
         *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits, *UNLIMITED,
     ]  # fmt: skip
     given = " ".join(repr(float(number)) for number in numbers)
@@ -207,7 +229,9 @@ def _simple_pid(case: Case, steps: int, repeats: int) -> Rate:
 
 def _answer(case: Case) -> Callable[[float, float, float], tuple[float, float, float]]:
     """The law in plain Python: y, u_i, z to u, u_i, z for a setpoint of 1."""
-    kp, ki_h, kd_h, phi, alpha, beta, q, _ = (float(value) for value in coefficients(case.gains, case.sample_period)[:, 0])
+    kp, ki_h, kd_h, phi, alpha, beta, q, _ = (
+        float(value) for value in coefficients(case.gains, case.sample_period)[:, 0]
+    )
 
     def answer(y: float, u_i: float, z: float) -> tuple[float, float, float]:
         e, e_d = 1.0 - y, 1.0 - beta - y
@@ -260,7 +284,9 @@ def _bdsim(case: Case, seconds: float) -> Rate:
     diagram.compile()
     _check(case, simulation.run(diagram, T=seconds).clock0.X[:, 0], first=1)
     steps = round(seconds / case.sample_period)
-    return rate("bdsim, a clocked state and a function", "steps/s", steps, lambda: simulation.run(diagram, T=seconds), 3)
+    return rate(
+        "bdsim, a clocked state and a function", "steps/s", steps, lambda: simulation.run(diagram, T=seconds), 3
+    )
 
 
 def _solve_ivp(case: Case, seconds: float) -> Rate:

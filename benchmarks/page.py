@@ -46,7 +46,8 @@ def _head(results: Mapping[str, Result]) -> list[str]:
     lines = [
         "# Figures",
         "",
-        "How fast and how good tdof_npid_ros is, measured beside what one would use instead. tdof_npid_ros is a control "
+        "How fast and how good tdof_npid_ros is, measured beside what one would use instead. tdof_npid_ros is a "
+        "control "
         "loop as ROS 2 nodes: a simulated *plant*, a *controller* (nonlinear PID), a *tuner* that finds the "
         "controller's gains by a hybrid genetic algorithm (HGA), a *recorder* to MCAP bags. A *lane* is one of many "
         "independent loops that are computed side by side; in *lockstep* plant and controller wait for each other.",
@@ -65,7 +66,8 @@ def _head(results: Mapping[str, Result]) -> list[str]:
     lines += [
         "",
         "All of it again: `make bench` (under half an hour on two quiet cores) writes this page; "
-        "`python -m benchmarks --only NAME` renews one section. `make bench-long` renews what takes too long for that: seeds and "
+        "`python -m benchmarks --only NAME` renews one section. `make bench-long` renews what takes too long for "
+        "that: seeds and "
         "soak.",
         "",
         "## The machine",
@@ -121,7 +123,9 @@ def _number(value: float) -> str:
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     if abs(value) >= 1e5:
-        return next(f"{value / size:,.4g} {word}" for size, word in ((1e6, "million"), (1e3, "thousand")) if abs(value) >= size)
+        return next(
+            f"{value / size:,.4g} {word}" for size, word in ((1e6, "million"), (1e3, "thousand")) if abs(value) >= size
+        )
     if abs(value) >= 1000:
         return f"{value:,.0f}"
     return f"{value:.3g}"
@@ -208,4 +212,3 @@ def _draw_curve(axes: Any, curve: Curve) -> None:
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-

@@ -1,7 +1,8 @@
 """A bare ping-pong of JointState messages between two processes.
 
 One message is on its way at a time, as in the loop, and it is as long as the loop's. `python -m benchmarks.ping_pong
-ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second. With `unread` for the executor, the events executor
+ping|pong EXECUTOR LANES MESSAGES`; ping prints round trips per second. With `unread` for the executor, the events
+executor
 hands on the messages' bytes, of which only the stamp is looked at: the limit of any loop over rclpy.
 """
 
@@ -46,7 +47,7 @@ def play(role: str, executor_name: str, lanes: int, messages: int) -> None:
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import JointState
 
-    from tdof_npid_ros.graph.messages import lane_names
+    from tdof_npid_ros.graph.runtime.messages import lane_names
 
     rclpy.init()
     node = rclpy.create_node(role)

@@ -21,20 +21,27 @@ from tdof_npid_ros.graph.processes import NodeProcesses
 TITLE = "Realtime: how well the period is kept"
 METHOD = (
     "The plant node in realtime mode, in a closed loop with the controller node, at 100 Hz and at 1 kHz: how far its "
-    "period is off, by its own diagnostics, and the time from an output to the effort that answers it. Beside it a bare "
+    "period is off, by its own diagnostics, and the time from an output to the effort that answers it. Beside it a "
+    "bare "
     "rclpy node with one steady timer and the fastest executor. Normal scheduling for both. In turn, fifteen times: "
-    "three seconds of the bare timer, after one to warm up, then two to three of the plant, from its activation on; the "
+    "three seconds of the bare timer, after one to warm up, then two to three of the plant, from its activation on; "
+    "the "
     "other is inactive meanwhile. What else the machine does changes within minutes, so a "
     "ratio is the median of those of neighbours in time."
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
-    "The p99 is made of single ticks that come 0.05 to 1 ms late, at random times: what else the machine does. From one three "
-    "seconds to the next it varies by a factor of ten, the bare timer's too. With six times five seconds each, and the medians "
+    "The p99 is made of single ticks that come 0.05 to 1 ms late, at random times: what else the machine does. From "
+    "one three "
+    "seconds to the next it varies by a factor of ten, the bare timer's too. With six times five seconds each, and "
+    "the medians "
     "of both compared, the verdict was chance: 0.5 to 4.5 in eight runs of this section. Hence the neighbours.",
-    "What bounds it: each tick's work (a step, a message out, one in) wakes five threads of two processes on two cores. "
-    "Tried without an effect beyond the variation, at 1 kHz: no controller (p99 24 to 157 us, with one 41 to 62), heartbeats "
-    "every 100 ms in place of 10, no timer's thread at every message, diagnostics that take a quarter of the time. `priority` "
+    "What bounds it: each tick's work (a step, a message out, one in) wakes five threads of two processes on two "
+    "cores. "
+    "Tried without an effect beyond the variation, at 1 kHz: no controller (p99 24 to 157 us, with one 41 to 62), "
+    "heartbeats "
+    "every 100 ms in place of 10, no timer's thread at every message, diagnostics that take a quarter of the time. "
+    "`priority` "
     "and `cpu` (SCHED_FIFO, affinity) are there for machines that allow them; the figures are without.",
 )
 
@@ -73,7 +80,8 @@ def run(size: str) -> Result:
         result.verdicts.append(Verdict(claim, statistics.median(ratios), 1.5, at_most=True))
         answer = {p: [one[f"output_to_effort_{p}"] for one in ours] for p in ("p50", "p99")}
         result.notes.append(
-            f"{name}: {ours[-1]['steps']:,.0f} ticks, {ours[-1]['missed_ticks']:,.0f} missed; output to effort p50 {min(answer['p50']):.0f} to "
+            f"{name}: {ours[-1]['steps']:,.0f} ticks, {ours[-1]['missed_ticks']:,.0f} missed; output to effort p50 "
+            f"{min(answer['p50']):.0f} to "
             f"{max(answer['p50']):.0f} us, p99 {min(answer['p99']):.0f} to {max(answer['p99']):.0f} us; "
             f"p99 beside a neighbour's {min(ratios):.2f} to {max(ratios):.2f}"
         )

@@ -12,8 +12,10 @@ from benchmarks.harness import Result, Verdict, main, ros_environment, summary
 
 TITLE = "Recording a loop at full speed"
 METHOD = (
-    "A lockstep episode of Process 1 of 100,000 steps at full speed, after a short one, with and without the recorder, in "
-    "turn, three times. `lossless`: the loop waits for its log. Every bag is then checked: messages lost by the recorder's own count and "
+    "A lockstep episode of Process 1 of 100,000 steps at full speed, after a short one, with and without the "
+    "recorder, in "
+    "turn, three times. `lossless`: the loop waits for its log. Every bag is then checked: messages lost by the "
+    "recorder's own count and "
     "by the gaps in the stamps; every control effort recomputed from it (`tdof-npid verify`); outputs and efforts "
     "compared with the in-process simulation, bit for bit."
 )
@@ -75,7 +77,8 @@ def run(size: str) -> Result:
 
 
 def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None, lanes: int = 1) -> float:
-    """An episode of Process 1 through the nodes, after a short one; returns its steps per second, from the plant's report
+    """An episode of Process 1 through the nodes, after a short one; returns its steps per second, from the plant's
+    report
     that the short one has ended to its report that this one has. The bag is `folder/bag`.
 
     Args:

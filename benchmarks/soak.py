@@ -44,7 +44,9 @@ def run(size: str) -> Result:
         result.rates.append(summary(f"{node} after {warm_up:g} s", "MiB", [before], ours=True))
         result.rates.append(summary(f"{node} from then on", "MiB", after, ours=True))
         growth = max(after) - before
-        result.verdicts.append(Verdict(f"growth of the {node} after {warm_up:g} s, MiB", growth, LARGEST_GROWTH, at_most=True))
+        result.verdicts.append(
+            Verdict(f"growth of the {node} after {warm_up:g} s, MiB", growth, LARGEST_GROWTH, at_most=True)
+        )
     result.notes.append(f"{missed_ticks:,.0f} ticks of the plant's timer missed in {seconds:g} s")
     return result
 

@@ -12,8 +12,10 @@ from benchmarks.harness import ROOT, Rate, Result, Verdict, last_line, main, sec
 
 TITLE = "Start-up"
 METHOD = (
-    "Whole processes, from their start to their exit: `tdof-npid --help`, and `tdof-npid simulate p1-c0.5` for the first "
-    "time after installation (an empty folder for compiled code) and for the second. For a node: from its start until it "
+    "Whole processes, from their start to their exit: `tdof-npid --help`, and `tdof-npid simulate p1-c0.5` for the "
+    "first "
+    "time after installation (an empty folder for compiled code) and for the second. For a node: from its start until "
+    "it "
     "has answered the first `output` that it was sent over DDS, discovery included; beside it a bare rclpy node that "
     "answers the same message. `import numba` is what any program with compiled code pays."
 )
@@ -60,7 +62,9 @@ def run(size: str) -> Result:
         Verdict("tdof-npid --help, s", help_.median, 0.2, at_most=True),
         Verdict("first simulate, compilation included, s", fresh.median, None),
         Verdict("second simulate, s", second.median, 1.5, at_most=True),
-        Verdict("node until its first answer, s more than a bare one", node.median - bare_node.median, 1.0, at_most=True),
+        Verdict(
+            "node until its first answer, s more than a bare one", node.median - bare_node.median, 1.0, at_most=True
+        ),
     ]
     return result
 
@@ -76,7 +80,9 @@ def _call(command: list[str], extra: dict[str, str] | None = None) -> str:
     return done.stdout
 
 
-def _whole(name: str, command: list[str], repeats: int, extra: dict[str, str] | None = None, ours: bool = False) -> Rate:
+def _whole(
+    name: str, command: list[str], repeats: int, extra: dict[str, str] | None = None, ours: bool = False
+) -> Rate:
     if repeats > 1:
         _call(command, extra)  # warms the disk's cache
     return summary(name, "s", [seconds(lambda: _call(command, extra)) for _ in range(repeats)], ours=ours)

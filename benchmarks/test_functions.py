@@ -15,9 +15,12 @@ from benchmarks.tuning import BUDGET, Counted, Optimise, TargetReachedError, ask
 TITLE = "The HGA on standard test functions"
 METHOD = (
     "Sphere, Rosenbrock, Rastrigin, Ackley and Griewank in five dimensions; every optimiser has 8,000 evaluations and "
-    "20 seeds, and what counts is the lowest value found (the minimum is 0). The bounds lie unevenly about the minimum, "
-    "so that none gains from looking in the middle. The HGA runs with its polish, as `tdof-npid tune` does, and without, "
-    "as the paper has it. SciPy's `differential_evolution` (popsize 8) ends with its own polish; `dual_annealing` is as it "
+    "20 seeds, and what counts is the lowest value found (the minimum is 0). The bounds lie unevenly about the "
+    "minimum, "
+    "so that none gains from looking in the middle. The HGA runs with its polish, as `tdof-npid tune` does, and "
+    "without, "
+    "as the paper has it. SciPy's `differential_evolution` (popsize 8) ends with its own polish; `dual_annealing` is "
+    "as it "
     "comes, with its local search; both within the 8,000. pymoo: GA and DE with 40 individuals, PSO with 25, CMA-ES "
     "with 9 restarts. No goal is set: this is to say where the HGA wins and loses."
 )
@@ -72,6 +75,7 @@ def _scipy_polished(objective: Counted, lower: np.ndarray, upper: np.ndarray, se
 
     # Its polish takes some hundred evaluations; the generations get the rest.
     generations = (objective.budget - 400) // (8 * len(lower)) - 1
+
     def evaluate(x: Any) -> Any:  # a generation (d, n), or in the polish one point (d,)
         return objective(x.T) if x.ndim == 2 else float(objective(x)[0])
 

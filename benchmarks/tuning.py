@@ -26,12 +26,15 @@ METHOD = (
     "value, that of `tdof_npid_ros/paper/tuned.csv`: the best of three HGA runs of 8,000 evaluations "
     "(`python -m tdof_npid_ros.paper.retune`), which `python -m benchmarks.seeds` compares with SciPy's "
     "differential evolution at 80,000. All get our compiled objective, the same bounds and 8,000 evaluations, Optuna's "
-    "samplers fewer, as the table says, for the time they take; every optimiser runs 20 seeds on every row, Optuna's 10. "
+    "samplers fewer, as the table says, for the time they take; every optimiser runs 20 seeds on every row, Optuna's "
+    "10. "
     "In the share of rows one that did not get there counts with its budget, though it needs more. "
-    "Configurations: the HGA as `tdof-npid tune` runs it, with its polish by a quadratic model, which the paper's has not; "
+    "Configurations: the HGA as `tdof-npid tune` runs it, with its polish by a quadratic model, which the paper's has "
+    "not; "
     "SciPy `differential_evolution` with popsize 8, deferred updates, no "
     "polish; pymoo GA and DE with 40 individuals, PSO with 25, CMA-ES with 9 restarts; `cma` with restarts of doubled "
-    "population; Optuna as it comes. The second part asks how many of ten seeds reach the value that the paper published, "
+    "population; Optuna as it comes. The second part asks how many of ten seeds reach the value that the paper "
+    "published, "
     "within 8,000 evaluations; on the four NPID rows of Process 3 with sigma free."
 )
 PEERS = ("scipy", "pymoo", "cma", "optuna", "cmaes")
@@ -85,7 +88,9 @@ def ask_tell(algorithm: str, polish: int | None = None) -> Optimise:
 
     def run(objective: Counted, lower: np.ndarray, upper: np.ndarray, seed: int) -> None:
         options = {} if polish is None else {"polish": polish}
-        optimiser = make_optimizer(algorithm, lower, upper, seed=seed, population=40, generations=BUDGET // 40, **options)
+        optimiser = make_optimizer(
+            algorithm, lower, upper, seed=seed, population=40, generations=BUDGET // 40, **options
+        )
         while not optimiser.done:
             optimiser.tell(objective(optimiser.ask()))
 
@@ -175,7 +180,9 @@ def run(size: str) -> Result:
         for name in names
         for seed in (seeds[: len(seeds) // 2 or 1] if name.startswith("Optuna") else seeds)
     ]
-    published = [(row, seed) for row in rows if row in published_rows() for seed in (PUBLISHED_SEEDS if full else seeds)]
+    published = [
+        (row, seed) for row in rows if row in published_rows() for seed in (PUBLISHED_SEEDS if full else seeds)
+    ]
     with one_process_per_core() as pool:
         runs = list(pool.map(_one, work, chunksize=4))
         reached = list(pool.map(_reaches_published, published, chunksize=4))
@@ -235,19 +242,22 @@ def _state_evaluations(result: Result, runs: list[Run], rows: list[Row], names: 
     result.verdicts += [
         Verdict("share of rows on which the HGA needs the fewest evaluations (median of the seeds)",
                 len(fewest) / len(rows), 0.5),
-        Verdict("share of the HGA's runs that reach the target", float(np.mean([shares["HGA", r] for r in rows])), 0.95),
+        Verdict("share of the HGA's runs that reach the "
+        "target", float(np.mean([shares["HGA", r] for r in rows])), 0.95),
         Verdict(f"the same on its weakest row ({' '.join(least)})", shares["HGA", least], None),
     ]  # fmt: skip
     for name in names:
         mine = [run for run in runs if run.optimiser == name]
         counts = [min(run.evaluations, budgets[name]) for run in mine]
         note = f"{100 * np.mean([run.evaluations < math.inf for run in mine]):.0f} % of the runs get there"
-        note += f", {np.median([run.seconds for run in mine]):.2f} s a run on one core, worst {max(r.seconds for r in mine):.1f} s"
+        seconds = [run.seconds for run in mine]
+        note += f", {np.median(seconds):.2f} s a run on one core, worst {max(seconds):.1f} s"
         note += f", at most {budgets[name]} evaluations"
         result.rates.append(summary(f"{name}, all rows", "evaluations", counts, note=note, ours=name == "HGA"))
     header = ["row", *names]
     result.tables += [
-        Table("Evaluations until within 0.1 % of the best known, median (worst) of the seeds; the fewest in bold", header,
+        Table("Evaluations until within 0.1 % of the best known, median (worst) of the seeds; the fewest in "
+        "bold", header,
               [[label, *_evaluation_cells(cells, row, names, medians, budgets)]
                for label, row in zip(labels, rows, strict=True)]),
         Table("Share of the seeds that get there, in per cent", header,
@@ -272,7 +282,8 @@ def _evaluation_cells(
     least = min(medians[name, row] for name in names)
     shown = []
     for name in names:
-        text = f"{_count(medians[name, row], budgets[name])} ({_count(max(r.evaluations for r in cells[name, row]), budgets[name])})"
+        worst = max(run.evaluations for run in cells[name, row])
+        text = f"{_count(medians[name, row], budgets[name])} ({_count(worst, budgets[name])})"
         shown.append(f"**{text}**" if medians[name, row] == least < math.inf else text)
     return shown
 

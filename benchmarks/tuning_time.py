@@ -17,9 +17,11 @@ METHOD = (
 )
 PEERS = ("cma", "scipy")
 NOTES = (
-    "On the linear rows a quarter of a run is the HGA's own arithmetic between evaluations; it was half of the run before "
+    "On the linear rows a quarter of a run is the HGA's own arithmetic between evaluations; it was half of the run "
+    "before "
     "its Cholesky factors were compiled. Its polish asks for few candidates at "
-    "a time, which costs more calls and fewer evaluations to the target than DE's whole generations. On the circuit, of "
+    "a time, which costs more calls and fewer evaluations to the target than DE's whole generations. On the circuit, "
+    "of "
     "which an episode has 30,000 steps, the evaluations prevail.",
 )
 
@@ -35,7 +37,9 @@ def run(size: str) -> Result:
     times: dict[str, list[float]] = {algorithm: [] for algorithm in ALGORITHMS}
     for case_name, controller in rows:
         case = load_case(case_name)
-        problems = {a: TuningProblem(case, controller, (), case.weight, a, 1, POPULATION, generations) for a in ALGORITHMS}
+        problems = {
+            a: TuningProblem(case, controller, (), case.weight, a, 1, POPULATION, generations) for a in ALGORITHMS
+        }
         for algorithm, problem in problems.items():
             objective = Objective(problem)
             objective(Study(problem).ask())  # compiles
@@ -47,9 +51,13 @@ def run(size: str) -> Result:
     labels = [" ".join(row) for row in rows]
     slowest, row = max(zip(times["hga"], labels, strict=True))
     cores = available_cores()
-    result.verdicts.append(Verdict(f"full HGA run on {cores} cores, slowest row ({row}), s", slowest, LIMIT, at_most=True))
+    result.verdicts.append(
+        Verdict(f"full HGA run on {cores} cores, slowest row ({row}), s", slowest, LIMIT, at_most=True)
+    )
     ratio = sum(times["hga"]) / sum(times["de"])
-    result.verdicts.append(Verdict("time of the HGA's runs, times that of SciPy DE's with as many evaluations", ratio, None))
+    result.verdicts.append(
+        Verdict("time of the HGA's runs, times that of SciPy DE's with as many evaluations", ratio, None)
+    )
     cells = [[f"{times[a][i]:.2f}" for a in ALGORITHMS] for i in range(len(rows))]
     result.tables.append(
         Table("Wall time of 8,000 evaluations, in s", ["row", *ALGORITHMS.values()],

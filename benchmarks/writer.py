@@ -55,7 +55,9 @@ def run(size: str) -> Result:
         }
         result.rates += rates.values()
         ours = rates["tdof_npid_ros"].median
-        result.verdicts.append(Verdict(f"chunks in {compression}, times the raw mcap writer", ours / rates["mcap"].median, 0.7))
+        result.verdicts.append(
+            Verdict(f"chunks in {compression}, times the raw mcap writer", ours / rates["mcap"].median, 0.7)
+        )
         result.verdicts.append(Verdict(f"chunks in {compression}, times rosbags", ours / rates["rosbags"].median, None))
     result.verdicts.append(Verdict(f"lost of {2 * rounds * messages:,} messages", lost, 0, at_most=True))
     return result

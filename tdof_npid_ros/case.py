@@ -22,13 +22,13 @@ from tdof_npid_ros.control.gains import (
     GainsError,
     gains_from_mapping,
 )
-from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
+from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
-from tdof_npid_ros.parameter_names import OF_NODE, unknown_parameters
+from tdof_npid_ros.parameters import OF_NODE, unknown_parameters
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant, PlantError
-from tdof_npid_ros.scenario import Plan, PlanError, Signals, parse_plan
+from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan
 
 DEFAULT_SAMPLE_PERIOD = 0.01  # s
 Bounds = tuple[float, float]
@@ -43,7 +43,7 @@ class Case:
         sample_period_ns: of the loop.
         model: the plant's model, and `plant_values` its parameters.
         effort_limits: the plant's own limits on the effort.
-        gains: the controller's, and `operation` what is set around its law.
+        gains: the controller's, and `options` what is set around its law.
         episodes: the scenario's lines by episode, in the order in which they run.
         bounds: of the tuner's search, by gain.
         weight: w of the objective (10).
@@ -58,7 +58,7 @@ class Case:
     episodes: Mapping[str, tuple[str, ...]]
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     weight: float = 1.0
-    operation: Operation = PLAIN
+    options: ControllerOptions = PLAIN
 
     @property
     def sample_period(self) -> float:
@@ -91,7 +91,7 @@ class Case:
         return plans
 
     @cached_property
-    def signals(self) -> dict[str, Signals]:
+    def signals(self) -> dict[str, SampledPlan]:
         """The plan of each episode, sampled."""
         return {name: plan.sampled(self.sample_period_ns) for name, plan in self.plans.items()}
 
@@ -105,16 +105,16 @@ class Case:
             known = ", ".join(self.episodes) or "none"
             raise PlanError(f"{self.name} has no episode {episode!r}: its scenario's episodes are {known}")
         gains, signals = gains or self.gains, self.signals[episode]
-        if self.operation.is_plain:
+        if self.options.is_plain:
             return loop.simulate(self.plant_at, gains, signals, self.effort_limits)
-        return loop.simulate_operated(self.plant_at, gains, self.operation, signals, self.effort_limits)
+        return loop.simulate_operated(self.plant_at, gains, self.options, signals, self.effort_limits)
 
     def integrals(self, episode: str, gains: Gains) -> loop.Integrals:
         """Run an episode in process and keep only its integrals."""
-        if not self.operation.is_plain:
+        if not self.options.is_plain:
             raise PlantError(
                 f"{self.name}: tuning runs the law alone; take these out of the controller's parameters first: "
-                + ", ".join(name for name, value in self.operation.as_dict().items() if value != PLAIN.as_dict()[name])
+                + ", ".join(name for name, value in self.options.as_dict().items() if value != PLAIN.as_dict()[name])
             )
         return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
 
@@ -137,14 +137,19 @@ class Case:
         """
         y, setpoint, _ = self._response("disturbance", gains)
         if not np.isclose(setpoint, y[0]):
-            raise _no_single_step(self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}")
+            raise _no_single_step(
+                self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
+            )
         return disturbance_metrics(y, setpoint, self.sample_period)
 
     def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float, float]:
-        """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start on."""
+        """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start
+        on."""
         lanes = (gains or self.gains).lanes
         if lanes > 1:
-            raise GainsError(f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each")
+            raise GainsError(
+                f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each"
+            )
         output = self.simulate(episode, gains).output[:, 0]
         signals = self.signals[episode]
         for name, values in (("setpoint", signals.setpoint), ("disturbance", signals.disturbance)):
@@ -213,7 +218,7 @@ def load_case(name: str | Path) -> Case:
             episodes=read_episodes(scenario),
             bounds=_bounds(tuner),
             weight=_number("weight", tuner.get("weight", 1.0)),
-            operation=operation_from_mapping(controller),
+            options=options_from_mapping(controller),
         )
         _ = case.plant, case.plans
     except ValueError as error:

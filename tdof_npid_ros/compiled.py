@@ -1,6 +1,7 @@
 """How the hot functions are compiled: Numba, IEEE arithmetic, machine code kept on disk.
 
-No fast-math: a sum keeps its order and no multiply-add is fused but where it is written out, so a function gives the same bits wherever it is
+No fast-math: a sum keeps its order and no multiply-add is fused but where it is written out, so a function gives the
+same bits wherever it is
 inlined and however many lanes are vectorised. That is what the equalities E1-E4 stand on.
 """
 

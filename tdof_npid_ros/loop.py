@@ -20,20 +20,22 @@ from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
 from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of
-from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.states import loaded, store
-from tdof_npid_ros.scenario import Signals
+from tdof_npid_ros.scenario import SampledPlan
 
 VECTOR = 8  # lanes: block widths are multiples of it, and at least two of it
 LARGEST_BLOCK = 64  # lanes
-SOUND_OUTPUT = 1e12  # |y| from which on a lane counts as diverged; seen in the outputs alone, so the live tuner sees it
+LARGEST_OUTPUT = (
+    1e12  # |y| from which on a lane counts as diverged; seen in the outputs alone, so the live tuner sees it
+)
 
 # A lane's rows: its coefficients, then these, then the plant's state.
-(_U_I, _Z, _ERROR_SUM, _SOUND, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
+(_U_I, _Z, _ERROR_SUM, _FINITE, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
 
 PlantAt = Callable[[dict[str, float]], Plant]  # the plant for a set of changed parameters
 
@@ -62,14 +64,14 @@ class Integrals:
 
     Attributes:
         iae: integral of the absolute error (9), trapezoidal rule, (lanes,).
-        sound_share: share of the outputs below SOUND_OUTPUT, (lanes,); 1 for a lane that did not diverge.
+        finite_fraction: fraction of the outputs below LARGEST_OUTPUT, (lanes,); 1 for a lane that did not diverge.
     """
 
     iae: np.ndarray
-    sound_share: np.ndarray
+    finite_fraction: np.ndarray
 
 
-def simulate(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: tuple[float, float]) -> Trajectory:
+def simulate(plant_at: PlantAt, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Trajectory:
     """Run one episode and keep its trajectory.
 
     Args:
@@ -84,11 +86,15 @@ def simulate(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: t
 
 
 def simulate_operated(
-    plant_at: PlantAt, gains: Gains, operation: Operation, signals: Signals, effort_limits: tuple[float, float]
+    plant_at: PlantAt,
+    gains: Gains,
+    options: ControllerOptions,
+    signals: SampledPlan,
+    effort_limits: tuple[float, float],
 ) -> Trajectory:
-    """As `simulate`, with an operation around the law: stepped one by one, by the same classes as in the nodes."""
+    """As `simulate`, with options around the law: stepped one by one, by the same classes as in the nodes."""
     period_ns, lanes = signals.sample_period_ns, gains.lanes
-    controller = Controller(gains, period_ns, operation)
+    controller = Controller(gains, period_ns, options)
     simulator = PlantSimulator(plant_at({}), period_ns, lanes, effort_limits)
     plants = {segment.first: plant_at(segment.plant) for segment in signals.segments}
     output, effort = np.empty((2, signals.steps + 1, lanes))
@@ -102,7 +108,7 @@ def simulate_operated(
     return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
 
 
-def integrals(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: tuple[float, float]) -> Integrals:
+def integrals(plant_at: PlantAt, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Integrals:
     """Run one episode and keep only its integrals; arguments as for `simulate`."""
     nothing = np.empty((0, gains.lanes))
     return _run(plant_at, gains, signals, effort_limits, nothing, nothing)
@@ -111,23 +117,23 @@ def integrals(plant_at: PlantAt, gains: Gains, signals: Signals, effort_limits: 
 def _run(
     plant_at: PlantAt,
     gains: Gains,
-    signals: Signals,
+    signals: SampledPlan,
     limits: tuple[float, float],
     output: np.ndarray,
     effort: np.ndarray,
 ) -> Integrals:
     steps = signals.steps
     c = coefficients(gains, signals.sample_period_ns / 1e9)
-    iae, sound = np.empty((2, gains.lanes))
+    iae, finite = np.empty((2, gains.lanes))
     for block in _blocks(gains):
         gain_limits = limits_of(gains, block.start)
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
         lane_rows = _run_block_of(plant_at, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
-        iae[block], sound[block] = lane_rows[_ERROR_SUM : _SOUND + 1, : block.stop - block.start]
+        iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
         if len(output):
             output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
-    return Integrals(iae * (signals.sample_period_ns / 1e9), sound / (steps + 1))
+    return Integrals(iae * (signals.sample_period_ns / 1e9), finite / (steps + 1))
 
 
 def _blocks(gains: Gains) -> Iterator[slice]:
@@ -151,7 +157,7 @@ def _run_block_of(
     plant_at: PlantAt,
     c: np.ndarray,
     gain_limits: Limits,
-    signals: Signals,
+    signals: SampledPlan,
     limits: tuple[float, float],
     y: np.ndarray,
     u: np.ndarray,
@@ -179,7 +185,8 @@ def _run_block_of(
 
 
 def _aligned_zeros(rows: int, width: int) -> np.ndarray:
-    """Zeros, (rows, width), that begin at a cache line, as then does every row of a block: a vector lies in one line."""
+    """Zeros, (rows, width), that begin at a cache line, as then does every row of a block: a vector lies in one
+    line."""
     flat = np.zeros(rows * width + VECTOR)
     first = -flat.ctypes.data % (flat.itemsize * VECTOR) // flat.itemsize
     return flat[first : first + rows * width].reshape(rows, width)
@@ -214,7 +221,7 @@ def _run_lane(
     new = np.uint64(first) % size
     c = lane_coefficients(rows, 0, 1)
     x = loaded(x, rows, _X, 1)
-    u_i, z, error_sum, sound_outputs = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND]
+    u_i, z, error_sum, sound_outputs = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE]
     for k in range(np.uint64(first), np.uint64(last)):
         r, d = setpoint[k], disturbance[k]
         oldest = _next_slot(new, size)
@@ -223,14 +230,14 @@ def _run_lane(
         ring[new] = v
         x = advance_bounded(plant, x, ring[oldest], v if plant.delay == 0 else ring[due], d)
         error_sum += weight[k] * abs(r - y)
-        if abs(y) < SOUND_OUTPUT:
+        if abs(y) < LARGEST_OUTPUT:
             sound_outputs += 1.0
         if y_out.shape[0]:
             y_out[k] = y
             u_out[k] = u
         new = oldest
     store(x, rows, _X, 1)
-    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_SOUND] = u_i, z, error_sum, sound_outputs
+    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE] = u_i, z, error_sum, sound_outputs
 
 
 @entry_point
@@ -276,7 +283,7 @@ def _run_block(
             rows[_V * w + j] = v
             store(x, rows, _X * w + j, w)
             rows[_ERROR_SUM * w + j] += weight[k] * abs(r - y)
-            rows[_SOUND * w + j] += 1.0 if abs(y) < SOUND_OUTPUT else 0.0
+            rows[_FINITE * w + j] += 1.0 if abs(y) < LARGEST_OUTPUT else 0.0
             rows[_Y * w + j] = y
             rows[_U * w + j] = u
         _copy_row(rows, np.uint64(_V), ring, new, lanes)

@@ -32,7 +32,8 @@ class DisturbanceMetrics:
 
 
 def integral_absolute_error(setpoint: np.ndarray, output: np.ndarray, sample_period: float) -> float:
-    """IAE (9) by the trapezoidal rule; setpoint and output of shape (steps,), in the output's unit; result in unit·s."""
+    """IAE (9) by the trapezoidal rule; setpoint and output of shape (steps,), in the output's unit; result in
+    unit·s."""
     error = np.abs(setpoint - output)
     error[0] *= 0.5
     error[-1] *= 0.5

@@ -57,8 +57,9 @@ def episode_named(frame_id: str) -> str:
 
 
 @dataclass(frozen=True)
-class Signals:
-    """A plan sampled: setpoint and disturbance of shape (steps + 1,), and the stretches of constant plant parameters."""
+class SampledPlan:
+    """A plan sampled: setpoint and disturbance of shape (steps + 1,), and the stretches of constant plant
+    parameters."""
 
     sample_period_ns: int
     setpoint: np.ndarray
@@ -154,7 +155,7 @@ class Plan:
             )
         return steps
 
-    def sampled(self, sample_period_ns: int) -> Signals:
+    def sampled(self, sample_period_ns: int) -> SampledPlan:
         """The plan at the stamps k·sample_period_ns."""
         steps = self.steps(sample_period_ns)
         stamps = np.arange(steps + 1, dtype=np.int64) * sample_period_ns
@@ -162,7 +163,7 @@ class Plan:
         values = np.asarray(self.values, dtype=np.float64).reshape(len(self.times_ns), len(self.names))
         column = {name: values[points, i] for i, name in enumerate(self.names)}
         zero = np.zeros(steps + 1)
-        return Signals(
+        return SampledPlan(
             sample_period_ns,
             column.get("setpoint", zero),
             column.get("disturbance", zero),

@@ -101,8 +101,8 @@ def test_an_unstable_lane_stays_finite_and_is_told_from_the_sound_ones() -> None
     kp = (1.0, 4e5, 4e7)
     result = case.integrals("setpoint", Gains("pid", kp, 0.3, 0.0))
     assert np.isfinite(result.iae).all()
-    assert result.sound_share[0] == 1.0
-    assert 1.0 > result.sound_share[1] > result.sound_share[2]
+    assert result.finite_fraction[0] == 1.0
+    assert 1.0 > result.finite_fraction[1] > result.finite_fraction[2]
 
 
 def delayed_reference(gains: Gains, lag: float, dead_time: float, end: float, times: np.ndarray) -> np.ndarray:
@@ -154,4 +154,4 @@ def test_effort_limits_of_the_plant_hold_in_the_loop() -> None:
     free = load_case("p1-c0.5").simulate("setpoint", case.gains).output[:STEPS]
     limited = case.simulate("setpoint", case.gains).output[:STEPS]
     assert np.max(limited) < np.max(free)
-    assert integrals(case.plant_at, case.gains, case.signals["setpoint"], case.effort_limits).sound_share[0] == 1.0
+    assert integrals(case.plant_at, case.gains, case.signals["setpoint"], case.effort_limits).finite_fraction[0] == 1.0

@@ -223,7 +223,12 @@ def test_a_users_plant_has_its_parameters(tmp_path: Path, monkeypatch: pytest.Mo
         ("start", "import math", "import math; no_such_name", "NameError"),
         ("undefined", "math.sqrt(abs(x[0]))", "no_such_name", "no_such_name"),
         ("state", "return x[0]", "return x[7]", r"out of range.*state_tank.py"),
-        ("shape", ",)\n\n    @staticmethod\n    def output", ", 0.0)\n\n    @staticmethod\n    def output", "tuple of 1"),
+        (
+            "shape",
+            ",)\n\n    @staticmethod\n    def output",
+            ", 0.0)\n\n    @staticmethod\n    def output",
+            "tuple of 1",
+        ),
         ("method", "    @staticmethod\n    def output(x, p)", "    def output(self, x, p)", "static methods"),
         ("parameters", '{"area": 2.0}', "[2.0]", "map names to finite numbers"),
         ("value", '{"area": 2.0}', '{"area": "wide"}', "map names to finite numbers"),
@@ -255,7 +260,9 @@ def test_the_dead_time_of_a_plant_that_runs_does_not_change(dead_time: float) ->
     simulator = PlantSimulator(case.plant, case.sample_period_ns, 1, (-math.inf, math.inf))
     with pytest.raises(PlantError, match="dead_time cannot change"):
         simulator.change_plant(case.plant_at({"dead_time": dead_time}))
-    signals = replace(case.signals["setpoint"], segments=(Segment(0, 10, {}), Segment(10, 99, {"dead_time": dead_time})))
+    signals = replace(
+        case.signals["setpoint"], segments=(Segment(0, 10, {}), Segment(10, 99, {"dead_time": dead_time}))
+    )
     with pytest.raises(PlantError, match="dead_time cannot change"):
         simulate(case.plant_at, case.gains, signals, case.effort_limits)
     simulator.change_plant(case.plant_at({"gain": 2.0, "dead_time": 0.5}))

@@ -263,6 +263,8 @@ def test_different_sample_periods_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "loop.yaml"
     file.write_text("/**/plant: {ros__parameters: {}}\n/**/controller: {ros__parameters: {sample_period: 0.05}}\n")
     assert load_case(file).sample_period_ns  # the plant's is not given
-    file.write_text(file.read_text().replace("plant: {ros__parameters: {}", "plant: {ros__parameters: {sample_period: 0.01}"))
+    file.write_text(
+        file.read_text().replace("plant: {ros__parameters: {}", "plant: {ros__parameters: {sample_period: 0.01}")
+    )
     with pytest.raises(ParameterFileError, match=r"sample_period is 0\.01 in plant and 0\.05 in controller"):
         load_case(file)

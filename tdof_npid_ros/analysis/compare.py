@@ -12,7 +12,7 @@ from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.scenario import episode_named
-from tdof_npid_ros.signals import SignalReader
+from tdof_npid_ros.wire import SignalReader
 
 Key = tuple[str, int]  # episode and stamp in ns
 
@@ -99,7 +99,8 @@ class Comparison:
             return
         self.different += 1
         if not self.first:
-            self.first = f"at {key[1] / 1e9:.9g} s of {key[0] or 'the recording'}: {effort.tolist()}, recorded {expected.tolist()}"
+            place = f"at {key[1] / 1e9:.9g} s of {key[0] or 'the recording'}"
+            self.first = f"{place}: {effort.tolist()}, recorded {expected.tolist()}"
         if effort.shape == expected.shape:
             self.largest = max(self.largest, float(np.abs(effort - expected).max()))
 

@@ -113,7 +113,8 @@ def _episodes(loop: Loop) -> Iterator[Episode]:
 
 
 def _stretches(signal: Signal) -> list[slice]:
-    """Stretches of one episode each: the frame_id's episode stays the same, no stamp goes back to a start or far ahead."""
+    """Stretches of one episode each: the frame_id's episode stays the same, no stamp goes back to a start or far
+    ahead."""
     if not len(signal):
         return []
     stamps = signal.stamp_ns
@@ -202,7 +203,7 @@ def _episode(
         output=output,
         control_effort=effort,
         gains=tuple(configuration.gains for configuration in used),
-        plainly_operated=all(configuration.operation.is_plain for configuration in used),
+        plainly_operated=all(configuration.options.is_plain for configuration in used),
         plant=loop.plant.at(start_ns) if loop.plant is not None else {},
         missing=int(np.isnan(output).any(axis=1).sum()),
     )
@@ -231,7 +232,8 @@ def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np
         return np.arange(plan.steps(period_ns) + 1, dtype=np.int64) * period_ns
     if (stamps[-1] - stamps[0]) // period_ns > LARGEST_PLAN:
         raise AnalysisError(
-            f"{bag}: outputs stamped from {stamps[0] / 1e9:.9g} to {stamps[-1] / 1e9:.9g} s, mostly {period_ns} ns apart, "
+            f"{bag}: outputs stamped from {stamps[0] / 1e9:.9g} to {stamps[-1] / 1e9:.9g} s, mostly {period_ns} ns "
+            "apart, "
             f"are more than {LARGEST_PLAN:,} sample periods: analyse a shorter or more regular recording"
         )
     return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)

@@ -12,7 +12,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains, gains_from_mapping
-from tdof_npid_ros.control.operation import Operation, operation_from_mapping
+from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
 
 TOPIC = "/parameter_events"
 # The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.
@@ -78,7 +78,7 @@ class Configuration(NamedTuple):
     """All that a controller's answers are computed with."""
 
     gains: Gains
-    operation: Operation
+    options: ControllerOptions
     sample_period_ns: int
 
 
@@ -90,11 +90,11 @@ def configurations(histories: Mapping[str, ParameterHistory]) -> dict[str, Confi
             if "anti_windup" not in values or "sample_period" not in values:
                 continue
             try:
-                gains, operation = gains_from_mapping(values), operation_from_mapping(values)
+                gains, options = gains_from_mapping(values), options_from_mapping(values)
                 period_ns = sample_period_in_ns(values["sample_period"])
             except ValueError:
                 continue  # the node declares its parameters one by one: not all of them yet
-            found[parameters_digest(gains, period_ns, operation)] = Configuration(gains, operation, period_ns)
+            found[parameters_digest(gains, period_ns, options)] = Configuration(gains, options, period_ns)
     return found
 
 

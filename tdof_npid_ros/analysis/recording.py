@@ -13,7 +13,7 @@ from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
 from tdof_npid_ros.bag.columns import SEQUENCE
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.scenario import Plan, PlanError
-from tdof_npid_ros.signals import JOINT_STATE, SECOND
+from tdof_npid_ros.wire import JOINT_STATE, SECOND
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 _OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")

@@ -52,7 +52,7 @@ class EffortUse:
     Attributes:
         total_variation: sum of |u[k+1] - u[k]|.
         peak: largest |u|.
-        saturated_share: share of the samples at a limit.
+        saturated_share: fraction of the samples at a limit.
     """
 
     total_variation: float | None
@@ -76,7 +76,7 @@ def responses(episode: Episode, lane: int) -> list[Response]:
     if not changes or len(changes) > MOST_STEPS:
         return [_measured(episode, lane, "tracking", 0, last, 0.0, 1.0)]
     found = []
-    step = 1.0  # the setpoint step that the recovery band is a share of; the paper's is 1
+    step = 1.0  # the setpoint step that the recovery band is a fraction of; the paper's is 1
     ends = [*(at for at, _, _ in changes[1:]), last]
     for (first, kind, before), end in zip(changes, ends, strict=True):
         if kind == "setpoint":
@@ -91,13 +91,13 @@ def effort_use(episode: Episode, lane: int) -> EffortUse:
     u = u[~np.isnan(u)]
     if not u.size:
         return EffortUse(None, None, None)
-    share = None
+    fraction = None
     if episode.gains:
         limits = [limits_of(gains, min(lane, gains.lanes - 1))[:2] for gains in episode.gains]
         limits.append(_limits(episode))
         low, high = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
-        share = float(np.mean((u <= low) | (u >= high)))
-    return EffortUse(float(np.abs(np.diff(u)).sum()), float(np.abs(u).max()), share)
+        fraction = float(np.mean((u <= low) | (u >= high)))
+    return EffortUse(float(np.abs(np.diff(u)).sum()), float(np.abs(u).max()), fraction)
 
 
 def deviation(episode: Episode) -> Deviation:

@@ -1,4 +1,5 @@
-"""E2: every control effort of a bag, computed again from what the controller was given, is the recorded one, bit for bit.
+"""E2: every control effort of a bag, computed again from what the controller was given, is the recorded one, bit for
+bit.
 
 The answers are taken in the controller's order, each with the output that it names by stamp and episode, the
 setpoint that it bears, and the parameters whose digest it bears. They go through the same `Stamps` and `Controller`
@@ -204,11 +205,11 @@ class _Replay:
         return OTHER_LANES if len(y) != lanes or len(r) != lanes else None
 
     def _configure(self, configuration: Configuration) -> None:
-        gains, operation, period_ns = configuration
+        gains, options, period_ns = configuration
         if self._controller is None or self._controller.sample_period_ns != period_ns:
-            self._controller = Controller(gains, period_ns, operation)
-        elif (self._controller.gains, self._controller.operation) != (gains, operation):
-            self._controller.change(gains, operation)
+            self._controller = Controller(gains, period_ns, options)
+        elif (self._controller.gains, self._controller.options) != (gains, options):
+            self._controller.change(gains, options)
 
     def _begin(self, answer: _Answer, verdict: Verdict) -> None:
         """As the controller node does: from nothing, or within a running loop with the integral action it tells."""
@@ -240,7 +241,7 @@ class _Replay:
             return
         assert self._controller is not None
         inputs: dict[str, Any] = {"setpoint": _numbers(r), "output": _numbers(y), "parameters": answer.digest}
-        inputs |= self._controller.gains.as_dict() | self._controller.operation.as_dict()
+        inputs |= self._controller.gains.as_dict() | self._controller.options.as_dict()
         inputs |= {term: _numbers(row) for term, row in zip(TERMS, self._controller.terms, strict=True)}
         self._account.first = Difference(
             what,

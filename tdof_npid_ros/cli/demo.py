@@ -79,7 +79,8 @@ def _check_free(bag: Path) -> None:
 
 @contextmanager
 def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[Any]:
-    """The nodes, by name with their parameters, as processes, and a conductor for them; all of it ends with the context."""
+    """The nodes, by name with their parameters, as processes, and a conductor for them; all of it ends with the
+    context."""
     from tdof_npid_ros.graph.conductor import Conductor
     from tdof_npid_ros.graph.processes import NodeProcesses
 
@@ -127,7 +128,9 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
     with _loop(nodes) as conductor:
         conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
         episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
-        with tqdm(total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR, mininterval=_REDRAWN) as bar:
+        with tqdm(
+            total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR, mininterval=_REDRAWN
+        ) as bar:
             for round_, (name, gains) in enumerate(rounds.items()):
                 bar.set_description(f"{name:17}")
                 conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
@@ -145,6 +148,8 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
 
 
 _REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable
+
+
 def _as_printed(name: str) -> str:
     """A round's name as the paper writes controllers: TDOF-NPID2, tuned."""
     kind, comma, how = name.partition(",")

@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write one point as a ROS parameter file (one --ratio and --controller)",
     )
-    picked = parser.add_mutually_exclusive_group()
-    picked.add_argument("--index", type=int, metavar="N", help="of the point to write, by increasing IAE_SP")
-    picked.add_argument(
+    selected = parser.add_mutually_exclusive_group()
+    selected.add_argument("--index", type=int, metavar="N", help="of the point to write, by increasing IAE_SP")
+    selected.add_argument(
         "--weight",
         type=float,
         metavar="W",
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _refuse_bad_arguments(arguments: argparse.Namespace, fronts: int) -> None:
-    """Before minutes are spent on what could not be picked or written in the end."""
+    """Before minutes are spent on what could not be selected or written in the end."""
     path, index, weight = arguments.write, arguments.index, arguments.weight
     if arguments.seed < 0:
         raise TuningError(f"--seed {arguments.seed}: it must not be below 0")

@@ -30,7 +30,9 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = {name: getattr(arguments, name) for name in ("bag", "rate", "start", "loop", "clock", "compare")}
     namespace = "/" + arguments.namespace.strip("/")
     if not re.fullmatch(r"/|(/[A-Za-z_]\w*)+", namespace, re.ASCII):
-        raise ValueError(f"--namespace {arguments.namespace!r}: it must be names of letters, digits and _ between slashes")
+        raise ValueError(
+            f"--namespace {arguments.namespace!r}: it must be names of letters, digits and _ between slashes"
+        )
     ros = ["--ros-args", "-r", f"__ns:={namespace}"]
     for name, value in parameters.items():
         ros += ["-p", f"{name}:={json.dumps(value)}"]

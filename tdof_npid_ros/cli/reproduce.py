@@ -37,7 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{len(summary['items'])} tables and figures: {summary['page']}")
         if rows:
             print(
-                f"  published rows reproduced at the published gains: {sum(row['reproduced'] for row in rows)} of {len(rows)}"
+                f"  published rows reproduced at the published gains: {sum(row['reproduced'] for row in rows)} of "
+                f"{len(rows)}"
             )
             beaten = sum(one["lower_overshoot"] and one["lower_objective"] for one in conclusions)
             print(f"  TDOF-NPID beats PID in M_p and objective, ours tuned: {beaten} of {len(conclusions)}")

@@ -39,9 +39,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algorithm", default="hga", metavar="|".join(ALGORITHMS), help="default: hga")
     parser.add_argument("--population", type=int, default=POPULATION, metavar="N", help=f"default: {POPULATION}")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--generations", type=int, metavar="N", help=f"of a whole population each (default: {GENERATIONS})")
+    length.add_argument(
+        "--generations", type=int, metavar="N", help=f"of a whole population each (default: {GENERATIONS})"
+    )
     length.add_argument("--budget", type=int, metavar="N", help="evaluations, instead of --generations")
-    parser.add_argument("--polish", type=int, default=POLISH, metavar="N", help=f"candidates in a step of the HGA's polish, 0: none (default: {POLISH})")
+    parser.add_argument(
+        "--polish",
+        type=int,
+        default=POLISH,
+        metavar="N",
+        help=f"candidates in a step of the HGA's polish, 0: none (default: {POLISH})",
+    )
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")

@@ -1,4 +1,4 @@
-"""The controller: the law with its state and its operation, answering each output once.
+"""The controller: the law with its state and its options, answering each output once.
 
 It knows no ROS. The controller node calls `answer` for each message, `verify` for each message of a bag.
 """
@@ -23,7 +23,7 @@ from tdof_npid_ros.control.law import (
     coefficients,
     limits_of,
 )
-from tdof_npid_ros.control.operation import PLAIN, Operation
+from tdof_npid_ros.control.options import PLAIN, ControllerOptions
 from tdof_npid_ros.control.shaping import EFFORT, OUTPUT, SETPOINT, STATES, shape_lanes, shape_of
 
 (INTEGRAL, FILTER) = range(2)  # rows of the law's state
@@ -39,18 +39,18 @@ class Controller:
         effort: the latest answer u, (lanes,).
         terms: of the latest answer, (6, lanes): see `TERMS`.
         stamp_ns: of the output that the latest answer was for; None before the first.
-        gains, operation: the parameters of the next answer.
+        gains, options: the parameters of the next answer.
     """
 
-    def __init__(self, gains: Gains, sample_period_ns: int, operation: Operation = PLAIN) -> None:
+    def __init__(self, gains: Gains, sample_period_ns: int, options: ControllerOptions = PLAIN) -> None:
         self.sample_period_ns = sample_period_ns
         self.stamp_ns: int | None = None
         self._applied: np.ndarray | None = None
         self._integral: np.ndarray | None = None
-        operation.check_lanes(gains)
-        self._law = _Law(gains, operation, sample_period_ns)
+        options.check_lanes(gains)
+        self._law = _Law(gains, options, sample_period_ns)
         self._allocate()
-        self.change(gains, operation)
+        self.change(gains, options)
 
     @property
     def lanes(self) -> int:
@@ -77,23 +77,23 @@ class Controller:
         """Whether the latest answer is at the effort's limits, in any lane."""
         return bool(any_at_limit(self.effort, self._law.least, self._law.most))
 
-    def change(self, gains: Gains, operation: Operation) -> None:
+    def change(self, gains: Gains, options: ControllerOptions) -> None:
         """Go on with other parameters. The state is kept, unless the number of lanes changes.
 
         Raises:
             GainsError: the two do not fit together.
         """
-        operation.check_lanes(gains)
-        self.gains, self.operation = gains, operation
-        self._digest = parameters_digest(gains, self.sample_period_ns, operation)
+        options.check_lanes(gains)
+        self.gains, self.options = gains, options
+        self._digest = parameters_digest(gains, self.sample_period_ns, options)
         self._settled = False
         if gains.lanes != self._law.gains.lanes:
-            self._law = _Law(gains, operation, self.sample_period_ns)
+            self._law = _Law(gains, options, self.sample_period_ns)
             self._allocate()
 
     def change_gains(self, gains: Gains) -> None:
         """Go on with other gains, operated as before."""
-        self.change(gains, self.operation)
+        self.change(gains, self.options)
 
     def reset(self) -> None:
         """Forget the state and the latest answer."""
@@ -154,8 +154,8 @@ class Controller:
     def _settle(self, setpoint: np.ndarray, output: np.ndarray) -> None:
         """Before an answer: begin, or take over changed parameters."""
         before, self._settled = self._law, True
-        if (before.gains, before.operation) != (self.gains, self.operation):
-            self._law = _Law(self.gains, self.operation, self.sample_period_ns)
+        if (before.gains, before.options) != (self.gains, self.options):
+            self._law = _Law(self.gains, self.options, self.sample_period_ns)
         if self.stamp_ns is None:
             self._begin(setpoint, output)
         elif self._law is not before:
@@ -176,10 +176,10 @@ class Controller:
 
     def _take_over(self, before: _Law, setpoint: np.ndarray, output: np.ndarray) -> None:
         """Give the state of the law before to the one now, so that the effort does not jump."""
-        if before.operation.is_plain:
+        if before.options.is_plain:
             self._shaping[SETPOINT], self._shaping[OUTPUT] = self._latest
             self._shaping[EFFORT] = self.effort
-        if not self.operation.bumpless:
+        if not self.options.bumpless:
             return
         effort, terms = np.empty_like(self.effort), np.empty_like(self.terms)
         before.answer(setpoint, output, self._state.copy(), self._shaping.copy(), effort, terms)
@@ -190,7 +190,7 @@ class Controller:
         back = np.divide(derivative, law.c[KD_H], out=np.zeros_like(e_d), where=law.c[KD_H] != 0)
         self._state[FILTER] = e_d - back
         needed = effort - law.proportional(r, y) - derivative
-        if not before.operation.manual and before.limits == law.limits:
+        if not before.options.manual and before.limits == law.limits:
             # Beyond a limit in force the effort has room: the integral action need not give way, nor need it wind up.
             now, unlimited = self._state[INTEGRAL], terms[TERMS.index("unlimited_effort")]
             needed = np.where(unlimited > effort, np.maximum(needed, now), needed)
@@ -200,28 +200,29 @@ class Controller:
     def _derivative_that_stays(self, before: _Law) -> np.ndarray:
         """How much of the derivative action the new law goes on with, (lanes,), 0 to 1.
 
-        With a smaller K_d less of it, or what the new, faster filter would drop at the next sample would be a late jump.
+        With a smaller K_d less of it, or what the new, faster filter would drop at the next sample would be a late
+        jump.
         """
         kd, kd_before = self.gains.per_lane("kd"), before.gains.per_lane("kd")
         with np.errstate(over="ignore"):
-            share = np.divide(kd, kd_before, out=np.zeros(len(kd)), where=kd_before != 0)
-        return np.asarray(np.clip(share, 0.0, 1.0))
+            fraction = np.divide(kd, kd_before, out=np.zeros(len(kd)), where=kd_before != 0)
+        return np.asarray(np.clip(fraction, 0.0, 1.0))
 
 
 class _Law:
     """The law for one set of parameters, without state."""
 
-    def __init__(self, gains: Gains, operation: Operation, sample_period_ns: int) -> None:
-        self.gains, self.operation = gains, operation
+    def __init__(self, gains: Gains, options: ControllerOptions, sample_period_ns: int) -> None:
+        self.gains, self.options = gains, options
         self.c, self._limits = coefficients(gains, sample_period_ns / 1e9), limits_of(gains)
-        self.shape = shape_of(operation, sample_period_ns / 1e9)
+        self.shape = shape_of(options, sample_period_ns / 1e9)
         self._flat = self.c.ravel()
         lanes = gains.lanes
         self.least, self.most = (gains.per_lane(name).copy() for name in LIMITS_PER_LANE)
         self._low, self._high = self.least.copy(), self.most.copy()
         self._shaped = np.empty((2, lanes))
-        self._is_plain = operation.is_plain
-        self._manual = np.broadcast_to(np.asarray(operation.manual_effort, dtype=np.float64), (lanes,))
+        self._is_plain = options.is_plain
+        self._manual = np.broadcast_to(np.asarray(options.manual_effort, dtype=np.float64), (lanes,))
 
     def answer(
         self,
@@ -240,7 +241,7 @@ class _Law:
         integral = state[INTEGRAL].copy()
         r, y = self._shaped
         answer_lanes(self._flat, self._limits, self._low, self._high, r, y, state, effort, terms)
-        if self.operation.manual:
+        if self.options.manual:
             state[INTEGRAL] = integral  # the law's is set when it takes over again
             np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)
         shaping[EFFORT] = effort
@@ -264,8 +265,8 @@ class _Law:
     @property
     def limits(self) -> tuple[object, ...]:
         """All that bounds the effort."""
-        gains, operation = self.gains, self.operation
-        return gains.effort_min, gains.effort_max, operation.effort_rate
+        gains, options = self.gains, self.options
+        return gains.effort_min, gains.effort_max, options.effort_rate
 
     def proportional(self, r: np.ndarray, y: np.ndarray) -> np.ndarray:
         """u_p (7)."""
@@ -282,7 +283,7 @@ class _Law:
 
 
 @lru_cache(maxsize=1024)
-def parameters_digest(gains: Gains, sample_period_ns: int, operation: Operation = PLAIN) -> str:
+def parameters_digest(gains: Gains, sample_period_ns: int, options: ControllerOptions = PLAIN) -> str:
     """A name for what answers are computed with: 12 hexadecimal digits made from the values alone."""
-    content = repr((sorted(gains.as_dict().items()), sorted(operation.as_dict().items()), sample_period_ns))
+    content = repr((sorted(gains.as_dict().items()), sorted(options.as_dict().items()), sample_period_ns))
     return hashlib.sha256(content.encode()).hexdigest()[:12]

@@ -108,7 +108,8 @@ class Gains:
         signs = np.sign(np.stack([kp, ki, kd]))
         if np.any((signs.max(axis=0) > 0) & (signs.min(axis=0) < 0)):
             raise GainsError(
-                f"kp={self.kp}, ki={self.ki}, kd={self.kd} differ in sign: all >= 0 (direct) or all <= 0 (reverse action)"
+                f"kp={self.kp}, ki={self.ki}, kd={self.kd} differ in sign: all >= 0 (direct) or all <= 0 (reverse "
+                "action)"
             )
 
     @cached_property

@@ -19,7 +19,7 @@ class Joints:
         self._of: Sequence[str] = ()
         self._indices: list[int] = []
 
-    def picked(self, names: Sequence[str], field: np.ndarray) -> np.ndarray:
+    def selected(self, names: Sequence[str], field: np.ndarray) -> np.ndarray:
         """The values of the joints, (lanes,); everything if no joints were named, here or in the message.
 
         Raises:

@@ -9,7 +9,7 @@ import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.law import exp_minus_of
-from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.control.options import ControllerOptions
 
 # Rows of the state: the shaped setpoint, the filtered output and the effort of the sample before.
 (SETPOINT, OUTPUT, EFFORT) = range(3)
@@ -17,7 +17,7 @@ STATES = 3
 
 
 class Shape(NamedTuple):
-    """An operation as the compiled function reads it: steps are per sample, the filter's gain is 1 without filter."""
+    """Options as the compiled function reads it: steps are per sample, the filter's gain is 1 without filter."""
 
     setpoint_min: float
     setpoint_max: float
@@ -28,17 +28,17 @@ class Shape(NamedTuple):
     effort_step: float
 
 
-def shape_of(operation: Operation, sample_period: float) -> Shape:
-    """The shape of an operation that is sampled every `sample_period` seconds."""
-    t = operation.filter_time
+def shape_of(options: ControllerOptions, sample_period: float) -> Shape:
+    """The shape of options that are sampled every `sample_period` seconds."""
+    t = options.filter_time
     return Shape(
-        operation.setpoint_min,
-        operation.setpoint_max,
-        operation.setpoint_rate * sample_period,
+        options.setpoint_min,
+        options.setpoint_max,
+        options.setpoint_rate * sample_period,
         1.0 - exp_minus_of(sample_period / t) if t > 0 else 1.0,
-        operation.dead_band,
-        2.0 * math.pi if operation.angle else 0.0,
-        operation.effort_rate * sample_period,
+        options.dead_band,
+        2.0 * math.pi if options.angle else 0.0,
+        options.effort_rate * sample_period,
     )
 
 

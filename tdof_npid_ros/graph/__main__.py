@@ -11,14 +11,21 @@ import signal
 import sys
 from types import FrameType
 
-NODES = ("plant", "controller", "scenario", "tuner", "recorder", "replay")
+MODULES = {
+    "plant": "plant.node",
+    "controller": "controller_node",
+    "scenario": "scenario_node",
+    "tuner": "tuner.node",
+    "recorder": "recorder.node",
+    "replay": "replay_node",
+}
 
 
 def run(node: str, arguments: list[str]) -> None:
     """Run a node with its command line's arguments, the program's name first."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
-    importlib.import_module(f"tdof_npid_ros.graph.{node}_node").main(arguments)
+    importlib.import_module(f"tdof_npid_ros.graph.{MODULES[node]}").main(arguments)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
@@ -57,7 +64,7 @@ def replay() -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2 or sys.argv[1] not in NODES:
-        print(f"usage: python -m tdof_npid_ros.graph {{{','.join(NODES)}}} [--ros-args ...]", file=sys.stderr)
+    if len(sys.argv) < 2 or sys.argv[1] not in MODULES:
+        print(f"usage: python -m tdof_npid_ros.graph {{{','.join(MODULES)}}} [--ros-args ...]", file=sys.stderr)
         sys.exit(2)
     run(sys.argv[1], sys.argv[1:])

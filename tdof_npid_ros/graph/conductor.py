@@ -14,8 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from tdof_npid_ros.graph.messages import stamp_ns
-from tdof_npid_ros.graph.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.messages import stamp_ns
+from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 
 POLL = 0.02  # s
 

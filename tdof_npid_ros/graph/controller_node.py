@@ -18,12 +18,12 @@ from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, LARGEST_SIGNAL, Gains, gains_from_mapping
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
+from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
 from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
-from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd, patience_ns
-from tdof_npid_ros.graph.messages import lane_names, plan_from_message
-from tdof_npid_ros.graph.node import (
+from tdof_npid_ros.graph.runtime.endpoints import signal_qos
+from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd, patience_ns
+from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
+from tdof_npid_ros.graph.runtime.node import (
     ERROR,
     LATCHED_QOS,
     OK,
@@ -34,7 +34,7 @@ from tdof_npid_ros.graph.node import (
     run_node,
 )
 from tdof_npid_ros.scenario import Plan, episode_named
-from tdof_npid_ros.signals import NO_VALUES, Sample, SignalWriter
+from tdof_npid_ros.wire import NO_VALUES, Sample, SignalWriter
 
 DESCRIPTIONS = {
     "type": f"control law: {', '.join(CONTROLLER_TYPES)}",
@@ -78,7 +78,7 @@ class ControllerNode(LoopEnd):
         self.quiet_parameters.add("manual_effort")
         self._declare_options()
         self.controller = Controller(
-            gains_from_mapping(given), sample_period_in_ns(period), operation_from_mapping(given)
+            gains_from_mapping(given), sample_period_in_ns(period), options_from_mapping(given)
         )
         self.controller.warm_up()
         self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
@@ -175,7 +175,7 @@ class ControllerNode(LoopEnd):
     def _on_output(self, output: Sample) -> None:
         stamp, episode = output.stamp_ns, episode_named(output.frame_id)
         y = self._picked("output", output.name, output.position)
-        if y is None or not self.is_sound("output", y, self.controller.lanes, LARGEST_SIGNAL):
+        if y is None or not self.is_valid("output", y, self.controller.lanes, LARGEST_SIGNAL):
             return
         self.waiting = None
         if episode:
@@ -240,7 +240,8 @@ class ControllerNode(LoopEnd):
         return True
 
     def _applied(self, output: Sample) -> np.ndarray | None:
-        """The effort that the plant reports, or else our own latest; None if the controller is to begin from nothing."""
+        """The effort that the plant reports, or else our own latest; None if the controller is to begin from
+        nothing."""
         applied = self._picked("output", output.name, output.effort)
         if applied is not None and len(applied) == self.controller.lanes and np.isfinite(applied).all():
             return applied
@@ -278,7 +279,7 @@ class ControllerNode(LoopEnd):
     def _picked(self, topic: str, names: Sequence[str], values: np.ndarray) -> np.ndarray | None:
         """A signal's values for the lanes; None if it is refused."""
         try:
-            return self.joints.picked(names, values)
+            return self.joints.selected(names, values)
         except ValueError as error:
             self.refuse("rejected", f"{topic} refused", f": it {error}")
             return None
@@ -311,7 +312,8 @@ class ControllerNode(LoopEnd):
         setpoint = self._setpoint(changes["setpoint"]) if "setpoint" in changes else self.setpoint
         if len(setpoint) not in (1, gains.lanes):
             raise ValueError(
-                f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or one per lane"
+                f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or "
+                "one per lane"
             )
         p = {**self.values_of(list(RANGES)), **changes}
         for name, (low, high) in RANGES.items():
@@ -326,11 +328,11 @@ class ControllerNode(LoopEnd):
         if "output_timeout" in changes:
             self.output_timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
 
-    def _configured(self, changes: dict[str, Any]) -> tuple[Gains, Operation]:
-        """Gains and operation with some parameters changed; ValueError if they are not valid."""
-        now = {**self.controller.gains.as_dict(), **self.controller.operation.as_dict(), **changes}
-        gains, operation = gains_from_mapping(now), operation_from_mapping(now)
-        operation.check_lanes(gains)
+    def _configured(self, changes: dict[str, Any]) -> tuple[Gains, ControllerOptions]:
+        """Gains and options with some parameters changed; ValueError if they are not valid."""
+        now = {**self.controller.gains.as_dict(), **self.controller.options.as_dict(), **changes}
+        gains, options = gains_from_mapping(now), options_from_mapping(now)
+        options.check_lanes(gains)
         if self.joints.names and gains.lanes != len(self.joints.names):
             raise ValueError(
                 f"the gains are for {gains.lanes} lanes, but there are {len(self.joints.names)} joint_names"
@@ -340,7 +342,7 @@ class ControllerNode(LoopEnd):
                 f"the gains are for {gains.lanes} lanes, but the loop that runs has {self.controller.lanes}: "
                 "deactivate the controller first"
             )
-        return gains, operation
+        return gains, options
 
     @property
     def _answers_live_outputs(self) -> bool:
@@ -367,7 +369,7 @@ class ControllerNode(LoopEnd):
             return ERROR, "output has stopped: look after the plant; the effort is as it was", facts
         if self.is_out_of_step:
             return ERROR, OUT_OF_STEP, facts
-        if self.controller.operation.manual:
+        if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts
 

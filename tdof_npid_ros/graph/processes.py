@@ -23,7 +23,8 @@ class NodeProcessError(RuntimeError):
 
 @contextmanager
 def _interrupted_afterwards() -> Iterator[None]:
-    """Let Ctrl-C wait until this is done: a process that has been started but is not noted yet would never be stopped."""
+    """Let Ctrl-C wait until this is done: a process that has been started but is not noted yet would never be
+    stopped."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

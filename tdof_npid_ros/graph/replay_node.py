@@ -18,10 +18,10 @@ from rosgraph_msgs.msg import Clock
 from tdof_npid_ros.analysis.compare import Comparison, Recorded
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
-from tdof_npid_ros.graph.messages import set_stamp
-from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
-from tdof_npid_ros.graph.tap import message_class
-from tdof_npid_ros.signals import SECOND, Sample
+from tdof_npid_ros.graph.runtime.messages import set_stamp
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
+from tdof_npid_ros.graph.runtime.tap import message_class
+from tdof_npid_ros.wire import SECOND, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now

@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
-from tdof_npid_ros.graph.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
-from tdof_npid_ros.graph.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
+from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
 from tdof_npid_ros.scenario import Plan, parse_plan
 
 PLANT = "plant."  # what begins the name of a plant's parameter in a plan
@@ -209,7 +209,9 @@ class ScenarioNode(LoopNode):
             return bool(now > self.wait_until_ns)
         values = self.told.result().values
         found = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=False)]
-        self.plant_before = [parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET]
+        self.plant_before = [
+            parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET
+        ]
         return True
 
     def _restore_plant(self) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from tdof_npid_ros.paper.evaluation import CASE_TITLES, CONTROLLER_TITLES, Row, Rows, deviation_percent
 from tdof_npid_ros.paper.report import Cell, Table
 from tdof_npid_ros.paper.tables import COMPARED
-from tdof_npid_ros.tuning.pareto import Front, dominated_share
+from tdof_npid_ros.tuning.pareto import Front, dominated_fraction
 
 # How near a row must come to count as reproduced: percentage points for M_p, per cent for the others.
 TOLERANCES = {"overshoot_percent": 2.0, "iae_setpoint": 4.0, "peak": 3.0, "iae_disturbance": 4.0}
@@ -99,7 +99,8 @@ def against_published(rows: Rows) -> Table:
         if at_least_as_good(row) == NO
     ]
     note = (
-        "Objective IAE_SP + IAE_DIS (s); Δ: ours, best seed, against the printed one. At or below: the printed value, and that of the published gains in our loop. "
+        "Objective IAE_SP + IAE_DIS (s); Δ: ours, best seed, against the printed one. At or below: the printed value, "
+        "and that of the published gains in our loop. "
         "Sprott: the latter only, for the printed numbers belong to another disturbance (see below)."
         + (f" Where NO, ours is at most {max(above):.2f} % above the printed value." if above else "")
     )
@@ -125,12 +126,13 @@ def front_claims(fronts: Sequence[Front]) -> Table:
         objective = {name: float(front.iae[front.best()].sum()) for name, front in of.items()}
         for name, front in of.items():
             gain = 100.0 * (1.0 - objective[name] / objective["pid"])
-            share = None if name == "pid" else f"{100.0 * dominated_share(of['pid'], front):.0f} %"
-            back = None if name == "pid" else f"{100.0 * dominated_share(front, of['pid']):.0f} %"
-            lines.append((f"L/T = {ratio:g}", CONTROLLER_TITLES[name], objective[name], gain, share, back))
+            fraction = None if name == "pid" else f"{100.0 * dominated_fraction(of['pid'], front):.0f} %"
+            back = None if name == "pid" else f"{100.0 * dominated_fraction(front, of['pid']):.0f} %"
+            lines.append((f"L/T = {ratio:g}", CONTROLLER_TITLES[name], objective[name], gain, fraction, back))
     columns = (
-        "plant", "controller", "least IAE_SP + IAE_DIS (s)", "less than PID (%)", "share of PID's front that it beats",
-        "share of its front that PID beats",
+        "plant", "controller", "least IAE_SP + IAE_DIS (s)", "less than PID (%)", "fraction of PID's front that it "
+        "beats",
+        "fraction of its front that PID beats",
     )  # fmt: skip
     note = "A point is beaten when some point of the other front is better in both measures."
     return Table("fronts", "Figure 6 in numbers", columns, tuple(lines), 1, note)
@@ -141,7 +143,7 @@ def front_statements(fronts: Sequence[Front]) -> tuple[str, ...]:
     ratios = sorted({front.ratio for front in fronts})
     of = {(front.ratio, front.controller): front for front in fronts}
     least = {key: float(front.iae[front.best()].sum()) for key, front in of.items()}
-    lags = min(dominated_share(of[ratio, "pid"], front) for (ratio, name), front in of.items() if name != "pid")
+    lags = min(dominated_fraction(of[ratio, "pid"], front) for (ratio, name), front in of.items() if name != "pid")
     gains = [100.0 * (1.0 - least[ratio, "tdof_npid2"] / least[ratio, "pid"]) for ratio in ratios]
     extra = [100.0 * (1.0 - least[ratio, "tdof_npid2"] / least[ratio, "tdof_npid1"]) for ratio in ratios]
     return (

@@ -26,12 +26,12 @@ from tdof_npid_ros.paper.inferred import (
     PROCESS3_SIGMA,
     Variant,
     as_stated,
-    derivative_share,
+    derivative_fraction,
     inferred,
     optimality,
     with_disturbance,
 )
-from tdof_npid_ros.paper.items import CHANGE_AT, GAIN_TITLES, SETTLED_AT, time_to_share_of_peak, variation_metrics
+from tdof_npid_ros.paper.items import CHANGE_AT, GAIN_TITLES, SETTLED_AT, time_to_fraction_of_peak, variation_metrics
 from tdof_npid_ros.paper.report import Cell, Finding, Table
 from tdof_npid_ros.paper.tables import ROWS, VARIATIONS, Published
 
@@ -85,23 +85,30 @@ def papers_simulation(cases: Collection[str]) -> Finding:
         deviations = [deviation_percent(value, getattr(row, metric)) for metric, value in values.items()]
         lines.append((CASE_TITLES[row.case], CONTROLLER_TITLES[row.controller], overshoot, *deviations))
     columns = (
-        "process", "controller", "Δ M_p (points)", "Δ t_s (%)", "Δ IAE_SP (%)", "Δ M_peak (%)", "Δ t_rcy (%)", "Δ IAE_DIS (%)",
+        "process", "controller", "Δ M_p (points)", "Δ t_s (%)", "Δ IAE_SP (%)", "Δ M_peak (%)", "Δ t_rcy (%)", "Δ "
+        "IAE_DIS (%)",
     )  # fmt: skip
     return Finding(
         "One reading that explains most rows",
         (
-            f"With the five assumptions below {near} of {len(lines)} rows agree within the tolerances above (or to the last "
-            "printed digit), most of them to a few tenths of a per cent, settling and recovery times included. The paper "
+            f"With the five assumptions below {near} of {len(lines)} rows agree within the tolerances above (or to "
+            "the last "
+            "printed digit), most of them to a few tenths of a per cent, settling and recovery times included. The "
+            "paper "
             "states none of the five. They were found by trying readings until the printed numbers came out, so their "
             "agreement with those same numbers is weak evidence. Only the authors could confirm them.",
-            "- The simulation is sampled every 0.01 s, and the derivative filter's state is advanced before it is used: the "
+            "- The simulation is sampled every 0.01 s, and the derivative filter's state is advanced before it is "
+            "used: the "
             "derivative action is weaker by about h/(2 T_f) than (1b), that is by 0.05 s · K_p in K_d.\n"
-            "- The effort of the Sprott circuit is limited to ±15, the usual supply of an operational amplifier, without "
+            "- The effort of the Sprott circuit is limited to ±15, the usual supply of an operational amplifier, "
+            "without "
             "anti-windup; its disturbance is 5, not 3.\n"
             "- σ = 2 in Process 3 (the disturbance responses of three of its four NPID rows do not fit it).\n"
-            "- t_s and t_rcy: the time to within 5 % of the largest error of that response (not 5 % and 2 % of the step).\n"
+            "- t_s and t_rcy: the time to within 5 % of the largest error of that response (not 5 % and 2 % of the "
+            "step).\n"
             "- Table 9: a changes when the loop is at rest.",
-            "The program keeps the stated conventions everywhere else: continuous-time law, σ = 1, d = 3, 5 % and 2 % bands.",
+            "The program keeps the stated conventions everywhere else: continuous-time law, σ = 1, d = 3, 5 % and 2 % "
+            "bands.",
         ),
         Table("papers_simulation", "The paper's simulation, inferred: deviations", columns, tuple(lines)),
     )
@@ -132,14 +139,21 @@ def printed_gains(cases: Set[str]) -> Finding:
         f"A test of that reading: {optimal[inferred]} of {len(rows)} printed sets of gains are optimal there, "
         f"{optimal[as_stated]} in the loop as the paper states it",
         (
-            "The authors tuned their gains. So in their own loop no other gains nearby can be better, whatever was printed "
-            f"about the responses. We searched from the printed gains: in the loop as the paper states it, {optimal[as_stated]} "
-            f"of {len(rows)} linear rows are optimal within {OPTIMAL:g} %, in the inferred simulation {optimal[inferred]} of "
-            f"{len(rows)}. The test was made after the reading had been settled and changed nothing in it, but it is not wholly "
-            "independent: that our tuned K_d lies below the printed one was known when the reading was chosen. That all gains "
+            "The authors tuned their gains. So in their own loop no other gains nearby can be better, whatever was "
+            "printed "
+            f"about the responses. We searched from the printed gains: in the loop as the paper states it, "
+            f"{optimal[as_stated]} "
+            f"of {len(rows)} linear rows are optimal within {OPTIMAL:g} %, in the inferred simulation "
+            f"{optimal[inferred]} of "
+            f"{len(rows)}. The test was made after the reading had been settled and changed nothing in it, but it is "
+            "not wholly "
+            "independent: that our tuned K_d lies below the printed one was known when the reading was chosen. That "
+            "all gains "
             "come out together was not.",
-            "It concerns the first and the third assumption. The rows that are optimal in neither loop are among the four "
-            "that the reading does not explain; their printed gains may be of another run, or the reading is wrong for them.",
+            "It concerns the first and the third assumption. The rows that are optimal in neither loop are among the "
+            "four "
+            "that the reading does not explain; their printed gains may be of another run, or the reading is wrong "
+            "for them.",
         ),
         Table(
             "printed_gains", "How far the printed gains are from the nearest optimum", columns, tuple(lines), 1,
@@ -151,7 +165,7 @@ def printed_gains(cases: Set[str]) -> Finding:
 def transient_times(case: Case, gains: Gains) -> tuple[float, float]:
     """Times (s) to within 5 % of the largest error, of the setpoint and the disturbance episode."""
     settling, recovery = (
-        time_to_share_of_peak(np.abs(case.simulate(name, gains).output[:, 0] - end), case.sample_period)
+        time_to_fraction_of_peak(np.abs(case.simulate(name, gains).output[:, 0] - end), case.sample_period)
         for name, end in (("setpoint", 1.0), ("disturbance", 0.0))
     )
     return settling, recovery
@@ -165,11 +179,12 @@ def process1(rows: Rows) -> Finding:
     ratios = [row.tuned.gains.per_lane("kd")[0] / row.published.kd for row in ours]
     overshoot = [row.at_published.number("overshoot_percent") - row.published.overshoot_percent for row in ours]
     peak = [100.0 * (1.0 - row.at_published.number("peak") / row.published.peak) for row in ours]
-    lost = [100.0 * (1.0 - derivative_share(row)) for row in published]
+    lost = [100.0 * (1.0 - derivative_fraction(row)) for row in published]
     return Finding(
         "Process 1 with c = 0.5: a larger overshoot here",
         (
-            f"With the printed gains, all three controllers overshoot {_span(overshoot)} percentage points more than printed, "
+            f"With the printed gains, all three controllers overshoot {_span(overshoot)} percentage points more than "
+            "printed, "
             f"and M_peak is {_span(peak)} % smaller. Another N, another dead time, or a rational "
             "approximation of the delay does not explain both. The inferred simulation does: here T_f is only 0.02 to "
             f"0.03 s, so that a simulation with 0.01 s loses {_span(lost)} % of the derivative action.",
@@ -201,13 +216,18 @@ def process3(rows: Rows) -> Finding:
         "Process 3: the NPID rows are not those of σ = 1",
         (
             f"With σ = 1, the biggest change of the setpoint, IAE_SP of the NPID rows is {_span(excess)} % above the "
-            "printed values, and no tuning reaches the printed objectives. With σ = 2, one of the values in the paper's "
-            "Figure 1, IAE_SP agrees within 1.1 % and M_p within 2.1 points; a linear law (k = 1) overshoots far too much. "
-            "The error of this process exceeds the setpoint step (it moves the wrong way first), so that σ = 1 switches "
+            "printed values, and no tuning reaches the printed objectives. With σ = 2, one of the values in the "
+            "paper's "
+            "Figure 1, IAE_SP agrees within 1.1 % and M_p within 2.1 points; a linear law (k = 1) overshoots far too "
+            "much. "
+            "The error of this process exceeds the setpoint step (it moves the wrong way first), so that σ = 1 "
+            "switches "
             "the integral action nearly off just then.",
             "Everything else here uses σ = 1 as the paper states. Tables 5 and 6 also show what tuning σ gives: it "
-            f"goes to the end of its range, where k(e) is nearly 1, in {ends} of {len(published)} rows. For this process the best "
-            "TDOF controller is the linear one; with σ = 1 the nonlinear gain costs more than it brings: PID's objective is the "
+            f"goes to the end of its range, where k(e) is nearly 1, in {ends} of {len(published)} rows. For this "
+            "process the best "
+            "TDOF controller is the linear one; with σ = 1 the nonlinear gain costs more than it brings: PID's "
+            "objective is the "
             f"lower one in {lost} of {len(published)} comparisons.",
         ),
         _variant_table("process3", "Process 3: σ", published, variants),
@@ -236,8 +256,10 @@ def sprott_disturbance() -> Finding:
     return Finding(
         "Sprott circuit: the printed disturbance response is not that of a disturbance of 3",
         (
-            "At rest the integral action must carry u = (d + 2 sgn(x₁))/0.6, and without a change of sign of the error it "
-            "has taken in IAE_DIS = u/K_i: with d = 3 from x = 0, 5/(0.6 K_i). The three printed IAE_DIS are 7/(0.6 K_i), "
+            "At rest the integral action must carry u = (d + 2 sgn(x₁))/0.6, and without a change of sign of the "
+            "error it "
+            "has taken in IAE_DIS = u/K_i: with d = 3 from x = 0, 5/(0.6 K_i). The three printed IAE_DIS are 7/(0.6 "
+            "K_i), "
             "to the printed digits. So they belong to d = 5, or to d = 3 with the sign term going from -2 to +2 "
             "(3 + 4 = 7) in a loop that was not at rest with u = 0 before. With d = 5, IAE_DIS agrees to the printed "
             "digits and M_peak within one unit of the last.",
@@ -275,14 +297,18 @@ def effort_limit(rows: Rows) -> Finding:
         "Sprott circuit: the effort limit is not given",
         (
             "The paper limits u to the operational amplifier's supply but does not say to what, nor how windup is "
-            "treated. In a loop as the paper states it, no single limit gives the three printed setpoint responses: IAE_SP of "
+            "treated. In a loop as the paper states it, no single limit gives the three printed setpoint responses: "
+            "IAE_SP of "
             "the two TDOF rows asks for about 40, M_p of PID for about 7 without anti-windup.",
-            "In the inferred simulation one limit does: with ±15 and no anti-windup, M_p is within 0.6 points, t_s and IAE_SP "
-            f"within 2 % in all three rows. The project uses ±{case.gains.effort_max:g}, an operational amplifier's usual supply, "
+            "In the inferred simulation one limit does: with ±15 and no anti-windup, M_p is within 0.6 points, t_s "
+            "and IAE_SP "
+            f"within 2 % in all three rows. The project uses ±{case.gains.effort_max:g}, an operational amplifier's "
+            "usual supply, "
             "everywhere. The disturbance of 3 needs an effort of 8.3 and so never meets the limit.",
             "Nothing in the circuit's model punishes large gains, so that tuning ends at the bounds of the search: "
             + ("; ".join(at_bounds) or "none")
-            + ". With bounds four times as wide, K_p grew to 5,500 to 6,000 and the objective fell further, so the bounds are "
+            + ". With bounds four times as wide, K_p grew to 5,500 to 6,000 and the objective fell further, so the "
+            "bounds are "
             "left where they are, at "
             + ", ".join(f"{GAIN_TITLES[name]} ≤ {case.bounds[name][1]:g}" for name in ("kp", "ki", "kd"))
             + ".",
@@ -303,25 +329,31 @@ def variation_at_rest() -> Finding:
         inferred_peak, _, inferred_recovery = variation_metrics(gains, row.a, SETTLED_AT, case)
         lines.append(
             (
-                f"a → {row.a:g}", CONTROLLER_TITLES[row.controller], 1e3 * row.iae, 1e3 * iae, deviation_percent(iae, row.iae),
-                1e3 * row.peak, 1e3 * peak, deviation_percent(peak, row.peak), deviation_percent(inferred_peak, row.peak),
+                f"a → {row.a:g}", CONTROLLER_TITLES[row.controller], 1e3 * row.iae, 1e3 * iae, deviation_percent(iae,
+                row.iae),
+                1e3 * row.peak, 1e3 * peak, deviation_percent(peak, row.peak), deviation_percent(inferred_peak,
+                row.peak),
                 row.recovery_time_s, CHANGE_AT + recovery, deviation_percent(CHANGE_AT + recovery, row.recovery_time_s),
                 deviation_percent(CHANGE_AT + inferred_recovery, row.recovery_time_s),
             )
         )  # fmt: skip
     columns = (
-        "variation", "controller", "IAE published (×10⁻³ s)", "IAE ours (×10⁻³ s)", "Δ IAE (%)", "M_peak published (×10⁻³)",
-        "M_peak ours (×10⁻³)", "Δ M_peak (%)", "Δ M_peak inferred (%)", "t_rcy published (s)", "t_rcy ours (s)", "Δ t_rcy (%)",
+        "variation", "controller", "IAE published (×10⁻³ s)", "IAE ours (×10⁻³ s)", "Δ IAE (%)", "M_peak published "
+        "(×10⁻³)",
+        "M_peak ours (×10⁻³)", "Δ M_peak (%)", "Δ M_peak inferred (%)", "t_rcy published (s)", "t_rcy ours (s)", "Δ "
+        "t_rcy (%)",
         "Δ t_rcy inferred (%)",
     )  # fmt: skip
     return Finding(
         "Table 9: the published numbers are those of a loop at rest",
         (
             "When a changes in a loop that has come to rest, all six IAE agree to four digits (they are "
-            "0.8·|1/0.6 - 1/a|/K_i), M_peak within 2 %, and t_rcy within 0.7 % if it is 5 s plus the time from the change to "
+            "0.8·|1/0.6 - 1/a|/K_i), M_peak within 2 %, and t_rcy within 0.7 % if it is 5 s plus the time from the "
+            "change to "
             "within 5 % of M_peak. With the change at 5 s as the text says, the same numbers come out only if nothing "
             "is left of the setpoint response by then; more is left, in the inferred simulation too.",
-            "From rest, the inferred simulation has M_peak and t_rcy several times nearer still, though it was not fitted to this "
+            "From rest, the inferred simulation has M_peak and t_rcy several times nearer still, though it was not "
+            "fitted to this "
             "table: its derivative action is again the right one.",
         ),
         Table("variation_at_rest", "Table 9 from rest, published gains", columns, tuple(lines)),
@@ -350,11 +382,14 @@ def times(cases: Collection[str]) -> Finding:
     return Finding(
         "Settling and recovery times: the paper's are those of 5 % of the largest error",
         (
-            "The paper says 5 % for t_s and 'within 2 % of the setpoint' for t_rcy. For a step of 1 the latter is ±0.02, which "
+            "The paper says 5 % for t_s and 'within 2 % of the setpoint' for t_rcy. For a step of 1 the latter is "
+            "±0.02, which "
             "matches few rows; the Sprott circuit's deviation of 0.008 never even leaves that band (0 here, 8 to 11 s "
-            "printed). Both printed times are those to within 5 % of the largest error of the response itself: M_peak for "
+            "printed). Both printed times are those to within 5 % of the largest error of the response itself: M_peak "
+            "for "
             "t_rcy; the step for t_s, but 1.2 to 1.3 times the step in Process 3, which first moves the wrong way.",
-            "Where ours as stated is much longer, one more oscillation peaks at 5.0 to 5.5 % instead of just below 5 %. "
+            "Where ours as stated is much longer, one more oscillation peaks at 5.0 to 5.5 % instead of just below 5 "
+            "%. "
             "The program's metrics stay the stated ones.",
         ),
         Table("times", "Settling and recovery times by definition, published gains", columns, tuple(lines), 2),

@@ -45,8 +45,8 @@ def inferred(row: Published, limit: float = LIMIT) -> Variant:
     printed. With e_d - z⁺ = φ (e_d - z), that is our law with K_d x/(eˣ - 1), x = h/T_f, and N so that T_f stays.
     """
     case, gains = paper_case(row.case), published_gains(row)
-    share = derivative_share(row)
-    gains = gains.with_values(kd=share * row.kd, n=share * gains.n)
+    fraction = derivative_fraction(row)
+    gains = gains.with_values(kd=fraction * row.kd, n=fraction * gains.n)
     case = replace(case, sample_period_ns=PERIOD_NS)
     if row.case == "sprott":
         case = with_disturbance(case, DISTURBANCE)
@@ -56,7 +56,7 @@ def inferred(row: Published, limit: float = LIMIT) -> Variant:
     return Variant("the paper's simulation, inferred", case, gains)
 
 
-def derivative_share(row: Published) -> float:
+def derivative_fraction(row: Published) -> float:
     """What is left of the derivative action in the inferred simulation: x/(eˣ - 1), x = h/T_f."""
     lag = PERIOD_NS / 1e9 * row.kp * published_gains(row).n / row.kd
     return lag / math.expm1(lag)

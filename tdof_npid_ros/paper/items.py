@@ -125,8 +125,10 @@ def variation_table(name: str) -> Item:
         )  # fmt: skip
         limit = paper_case("sprott").gains.effort_max
         note = (
-            f"From 5 s on, as the paper says, the setpoint response is not over yet in our loop (the effort limit of ±{limit:g} "
-            "makes the integral wind up), and its rest outweighs the effect of a. 'At rest': a changes at 120 s instead. "
+            f"From 5 s on, as the paper says, the setpoint response is not over yet in our loop (the effort limit of "
+            f"±{limit:g} "
+            "makes the integral wind up), and its rest outweighs the effect of a. 'At rest': a changes at 120 s "
+            "instead. "
             "The recovery times are with the evidence on Table 9."
         )
         return Table(name, "Table 9: the parameter a changes at 5 s, Sprott circuit", columns, tuple(rows), 2, note)
@@ -203,7 +205,8 @@ def variation_figure(name: str, a: float) -> Item:
         return Figure(
             name,
             f"Figure {name[6:]}: a changes from 0.6 to {a:g} at 5 s, Sprott circuit",
-            "The change cannot be seen beside the setpoint step, as the paper says. (c) shows it alone: the loop was at "
+            "The change cannot be seen beside the setpoint step, as the paper says. (c) shows it alone: the loop was "
+            "at "
             "rest when a changed, and time counts from there.",
             lambda path: figures.draw_panels(panels, path),
             data,
@@ -282,7 +285,11 @@ def variation_metrics(gains: Gains, a: float, change_at: float, case: Case | Non
     case = case or paper_case("sprott")
     deviation = np.abs(variation_response(gains, a, change_at, case))
     period = case.sample_period
-    return float(deviation.max()), float(np.trapezoid(deviation, dx=period)), time_to_share_of_peak(deviation, period)
+    return (
+        float(deviation.max()),
+        float(np.trapezoid(deviation, dx=period)),
+        time_to_fraction_of_peak(deviation, period),
+    )
 
 
 def variation_response(gains: Gains, a: float, change_at: float, case: Case) -> np.ndarray:
@@ -295,9 +302,9 @@ def variation_response(gains: Gains, a: float, change_at: float, case: Case) -> 
     return np.asarray(y[round(change_at / case.sample_period) :] - 1.0)
 
 
-def time_to_share_of_peak(deviation: np.ndarray, period: float, share: float = 0.05) -> float:
-    """The time (s) from which on |deviation| (steps,) stays within a share of its own largest value."""
-    return float((np.flatnonzero(deviation > share * deviation.max())[-1] + 1) * period)
+def time_to_fraction_of_peak(deviation: np.ndarray, period: float, fraction: float = 0.05) -> float:
+    """The time (s) from which on |deviation| (steps,) stays within a fraction of its own largest value."""
+    return float((np.flatnonzero(deviation > fraction * deviation.max())[-1] + 1) * period)
 
 
 def _from_rest(row: Row, a: float) -> Curve:

@@ -52,18 +52,25 @@ SECTIONS = {  # of the page: the paper's own
     ),
 }
 LEAD = """\
-S. Jin et al. propose two PID controllers with setpoint weights (two degrees of freedom, TDOF) and an integral action that \
-fades for large errors (nonlinear, N): TDOF-NPID1 and TDOF-NPID2. They tune them, and a PID, by a hybrid genetic algorithm \
-(HGA) for three linear processes and a chaotic circuit, and find theirs better. Here every table and figure is computed anew \
+S. Jin et al. propose two PID controllers with setpoint weights (two degrees of freedom, TDOF) and an integral \
+action that \
+fades for large errors (nonlinear, N): TDOF-NPID1 and TDOF-NPID2. They tune them, and a PID, by a hybrid genetic \
+algorithm \
+(HGA) for three linear processes and a chaotic circuit, and find theirs better. Here every table and figure is \
+computed anew \
 and set beside the printed one."""
 CONVENTIONS = """\
-- 'Published': as printed. 'Ours at the published gains': the printed gains in our loop. 'Ours, tuned': the gains that our \
+- 'Published': as printed. 'Ours at the published gains': the printed gains in our loop. 'Ours, tuned': the gains \
+that our \
 HGA finds for the same objective, IAE_SP + IAE_DIS, knowing nothing of the printed ones.
-- IAE: integral of the absolute error, after a unit step of the setpoint (SP) and after a disturbance (DIS). M_p: overshoot \
-in per cent of the step. t_s: time to within 5 % of the step. M_peak: largest deviation under the disturbance. t_rcy: time \
+- IAE: integral of the absolute error, after a unit step of the setpoint (SP) and after a disturbance (DIS). M_p: \
+overshoot \
+in per cent of the step. t_s: time to within 5 % of the step. M_peak: largest deviation under the disturbance. \
+t_rcy: time \
 to within 2 % of the setpoint step.
 - Δ: ours against the published value; green up to 4 % (M_p: points), amber up to 10 %, red beyond.
-- Our loop: the paper's equations (1) to (8), N = 10, σ = 1, sampled; plants discretised exactly, exact dead time. One set \
+- Our loop: the paper's equations (1) to (8), N = 10, σ = 1, sampled; plants discretised exactly, exact dead time. \
+One set \
 of conventions for all rows: nothing is adjusted where a row does not come out. The circuit's effort limit, \
 which the paper does not give, has a paragraph of its own."""
 
@@ -121,7 +128,12 @@ class Reproduction:
         cases = {case for name in self.names for case in ITEMS[name].cases}
         return [
             *(self._row_job(index) for index, row in enumerate(ROWS) if row.case in cases),
-            *(self._front_job(ratio, kind) for ratio in RATIOS for kind in range(len(CONTROLLER_TYPES)) if self._needs_fronts),
+            *(
+                self._front_job(ratio, kind)
+                for ratio in RATIOS
+                for kind in range(len(CONTROLLER_TYPES))
+                if self._needs_fronts
+            ),
             ("evidence", self._find),
             *((name, lambda name=name: self._build(name, folder)) for name in self.names),
             ("page", lambda: self._write_page(folder)),
@@ -230,19 +242,22 @@ class Reproduction:
             lost = [pair for pair in pairs if not all(beats_pid(self.rows, *pair))]
             rescued = sum(all(beats_pid(self.rows, *pair, sigma_tuned=True)) for pair in lost)
             yield (
-                "**The claim.** Tuned by our HGA, the TDOF-NPID controllers beat PID both in overshoot and in the objective "
+                "**The claim.** Tuned by our HGA, the TDOF-NPID controllers beat PID both in overshoot and in the "
+                "objective "
                 f"in {len(pairs) - len(lost)} of {len(pairs)} comparisons"
                 + (f"; NOT {_named(lost)} ({rescued} of these {len(lost)} do when σ is tuned too)." if lost else ".")
             )
             good = [at_least_as_good(row) for row in rows]
             yield (
-                f"**The optimiser.** Our HGA is at or below the published optimum in {good.count(YES)} of {len(good)} rows"
+                f"**The optimiser.** Our HGA is at or below the published optimum in {good.count(YES)} of {len(good)} "
+                "rows"
                 + (f", with σ tuned too in {good.count(WITH_SIGMA)} more" if WITH_SIGMA in good else "")
                 + (f"; NOT in {good.count(NO)}." if NO in good else ".")
             )
             away = [key for key, row in self.rows.items() if not reproduced(row)]
             yield (
-                f"**The printed numbers.** {len(rows) - len(away)} of {len(rows)} rows come out at the published gains, within 2 "
+                f"**The printed numbers.** {len(rows) - len(away)} of {len(rows)} rows come out at the published "
+                "gains, within 2 "
                 "points of M_p, 4 % of both IAE and 3 % of M_peak" + (f"; NOT {_named(away)}." if away else ".")
             )
         if self.findings:

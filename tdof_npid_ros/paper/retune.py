@@ -1,6 +1,6 @@
 """Writes `tuned.csv` anew: every case and controller type, tuned by the HGA at the paper's σ. From a checkout:
 
-    python -m tdof_npid_ros.paper.retune
+python -m tdof_npid_ros.paper.retune
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ import numpy as np
 class FailSafe:
     """The newest effort, as long as it is fresh.
 
-    After `timeout_ns` without an effort, the actuator takes the `fallback` effort, or holds the latest one. When efforts
+    After `timeout_ns` without an effort, the actuator takes the `fallback` effort, or holds the latest one. When
+    efforts
     come again, it goes over to them within `return_ns`, so that nothing jumps. Before the first effort it takes the
     fallback effort, or 0. Times are of a steady clock.
 
@@ -63,5 +64,5 @@ class FailSafe:
         if passed >= self._return_ns:
             self._returned_ns = None
             return self._effort
-        share = passed / self._return_ns
-        return np.asarray(self._from * (1.0 - share) + self._effort * share)
+        fraction = passed / self._return_ns
+        return np.asarray(self._from * (1.0 - fraction) + self._effort * fraction)

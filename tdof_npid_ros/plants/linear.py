@@ -83,7 +83,9 @@ def _sample(
     """
     delay, late_ns = divmod(dead_time_ns, period_ns)
     if delay > MOST_DELAY:
-        raise PlantError(f"dead_time is {dead_time_ns / 1e9:g} s, {delay:,} samples: it must not be more than {MOST_DELAY:,}")
+        raise PlantError(
+            f"dead_time is {dead_time_ns / 1e9:g} s, {delay:,} samples: it must not be more than {MOST_DELAY:,}"
+        )
     with _PRECISION, mpmath.workdps(DIGITS):
         period, late = mpmath.mpf(period_ns) / 10**9, mpmath.mpf(late_ns) / 10**9
         a, b = _observable_form(numerator, denominator)

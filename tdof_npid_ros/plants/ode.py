@@ -51,9 +51,13 @@ class Ode:
         PlantError: the class lacks a part, or its functions do not compile or return the wrong shape.
     """
 
-    def __init__(self, description: type, values: Mapping[str, float], initial_state: tuple[float, ...], substeps: float):
+    def __init__(
+        self, description: type, values: Mapping[str, float], initial_state: tuple[float, ...], substeps: float
+    ):
         if substeps < 1 or substeps != int(substeps):
-            raise PlantError(f"substeps is {substeps:g}: the integration takes a whole number of steps a sample, 1 or more")
+            raise PlantError(
+                f"substeps is {substeps:g}: the integration takes a whole number of steps a sample, 1 or more"
+            )
         self.description = description
         self.values = tuple(float(value) for value in values.values())
         self.initial_state = _state(initial_state, len(initial_state))

@@ -21,7 +21,7 @@ class StepTest:
 
     Attributes:
         levels: the two setpoints.
-        settle_band: an output is near the setpoint within this share of the step between the levels.
+        settle_band: an output is near the setpoint within this fraction of the step between the levels.
         settle_time: s that it must stay there to be settled.
         time_limit: s in which it must settle.
         safe_output, safe_effort: ranges that end a trial when they are left.
@@ -94,7 +94,7 @@ class Trial:
         setpoint: what the setpoint is to be now.
         outcome: empty while it runs; `unsettled` and `unsafe` are failures.
         iae: of the step, by the trapezoidal rule, for a step of 1.
-        share: how far a failed trial came, below 1; 1 for one that did not fail.
+        fraction: how far a failed trial came, below 1; 1 for one that did not fail.
     """
 
     def __init__(self, test: StepTest, before: float, after: float) -> None:
@@ -106,7 +106,7 @@ class Trial:
         self.setpoint = before
         self.outcome: Outcome = ""
         self.iae = 0.0
-        self.share = 0.0
+        self.fraction = 0.0
 
     def take(self, time: float, output: float, effort: float | None) -> None:
         """Take an output and the effort on the plant, at a time in s."""
@@ -115,7 +115,7 @@ class Trial:
         stepped = self.setpoint == self._after
         if not self._test.is_safe(output, effort):
             self.outcome = "unsafe"
-            self.share = min(self._settling.elapsed / self._test.time_limit, 0.999) if stepped else 0.0
+            self.fraction = min(self._settling.elapsed / self._test.time_limit, 0.999) if stepped else 0.0
             return
         self._settling.take(time, output)
         if stepped:
@@ -123,7 +123,7 @@ class Trial:
         if self._settling.settled and not stepped:
             self.setpoint, self._settling = self._after, Settling(self._test, self._after)
         elif self._settling.settled or (self._settling.too_late and stepped):
-            self.outcome, self.share = "measured", 1.0  # a slow one pays by its IAE over the whole time limit
+            self.outcome, self.fraction = "measured", 1.0  # a slow one pays by its IAE over the whole time limit
         elif self._settling.too_late:
             self.outcome = "unsettled"
 

@@ -6,7 +6,7 @@ The paper gives pseudo code and no formulas; the operators are our reading of it
 
 moves every individual towards (for eta r w > 1 beyond) the best, the worse the further; 0 < eta < 2 contracts.
 Then Michalewicz's non-uniform mutation moves each coordinate, with probability `mutation_rate`, towards one of its
-bounds by the share 1 - r^((1 - t/T)^shape): anywhere at first, hardly at all towards the last generation T.
+bounds by the fraction 1 - r^((1 - t/T)^shape): anywhere at first, hardly at all towards the last generation T.
 
 That finds the valley of a good controller in a generation or two and then creeps along it. So by default the HGA
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
@@ -109,8 +109,8 @@ class HGA(Optimizer):
     @property
     def _kept(self) -> int:
         """How many of the best points of this round the polish keeps."""
-        share = KEPT_PER_COEFFICIENT[min(self._round, len(KEPT_PER_COEFFICIENT) - 1)]
-        return int(share * coefficients(self.dimension))
+        fraction = KEPT_PER_COEFFICIENT[min(self._round, len(KEPT_PER_COEFFICIENT) - 1)]
+        return int(fraction * coefficients(self.dimension))
 
     @property
     def _exploration(self) -> int:
@@ -140,10 +140,10 @@ class HGA(Optimizer):
     def _mutated(self, x: Array) -> Array:
         mutates = self._random.random(x.shape) < self.mutation_rate
         bound = np.where(self._random.random(x.shape) < 0.5, 0.0, 1.0)
-        share = self._random.random(x.shape)
+        fraction = self._random.random(x.shape)
         power = Decimal(1.0 - self._age / self._exploration) ** Decimal(self.shape)
         for i, j in np.argwhere(mutates):
-            reach = 1.0 - float(Decimal(float(share[i, j])) ** power)
+            reach = 1.0 - float(Decimal(float(fraction[i, j])) ** power)
             x[i, j] += reach * (bound[i, j] - x[i, j])
         return x
 

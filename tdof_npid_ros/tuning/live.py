@@ -13,8 +13,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tdof_npid_ros.loop import SOUND_OUTPUT, Integrals
-from tdof_npid_ros.scenario import Signals
+from tdof_npid_ros.loop import LARGEST_OUTPUT, Integrals
+from tdof_npid_ros.scenario import SampledPlan
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.problem import EPISODES
 
@@ -40,12 +40,12 @@ class LiveLoop(Protocol):
 L = TypeVar("L", bound=LiveLoop)
 
 
-def integrals_of(signals: Signals, output: Array) -> Integrals:
+def integrals_of(signals: SampledPlan, output: Array) -> Integrals:
     """The integrals of an episode from its outputs (steps + 1, lanes): the same bits as `loop.integrals`."""
     error = signals.weight[:, None] * np.abs(signals.setpoint[:, None] - output)
     iae = np.cumsum(error, axis=0)[-1] * (signals.sample_period_ns / 1e9)  # a sum in the order of time
-    sound = np.count_nonzero(np.abs(output) < SOUND_OUTPUT, axis=0)
-    return Integrals(iae, sound / (signals.steps + 1))
+    finite = np.count_nonzero(np.abs(output) < LARGEST_OUTPUT, axis=0)
+    return Integrals(iae, finite / (signals.steps + 1))
 
 
 class EpisodeOutputs:
@@ -58,7 +58,7 @@ class EpisodeOutputs:
         cut: the episode cannot become complete any more: another one began, or outputs are missing.
     """
 
-    def __init__(self, digest: str, signals: Signals, lanes: int) -> None:
+    def __init__(self, digest: str, signals: SampledPlan, lanes: int) -> None:
         self._digest, self._signals, self._lanes = digest, signals, lanes
         self._output = np.empty((signals.steps + 1, lanes))
         self._seen = bytearray(signals.steps + 1)
@@ -110,7 +110,7 @@ class EpisodeOutputs:
         return True
 
 
-def shares(waiting: Mapping[str, Indices], loops: int) -> list[list[tuple[str, Indices]]]:
+def work_of_loops(waiting: Mapping[str, Indices], loops: int) -> list[list[tuple[str, Indices]]]:
     """What each of `loops` loops is to run: episodes, each with the candidates that still wait for it.
 
     An episode takes nearly as long with one lane as with many, so loops are given different episodes first, and only
@@ -140,16 +140,16 @@ def measure(
     results = {episode: Integrals(*np.empty((2, len(candidates)))) for episode in EPISODES}
     done = {episode: np.zeros(len(candidates), dtype=bool) for episode in EPISODES}
 
-    def work(loop: L, share: list[tuple[str, Indices]]) -> None:
-        for episode, part in share:
+    def work(loop: L, portion: list[tuple[str, Indices]]) -> None:
+        for episode, part in portion:
             measured = loop.run_episode(episode, candidates[part])
-            results[episode].iae[part], results[episode].sound_share[part] = measured.iae, measured.sound_share
+            results[episode].iae[part], results[episode].finite_fraction[part] = measured.iae, measured.finite_fraction
             done[episode][part] = True
 
     while not all(finished.all() for finished in done.values()):
         loops = usable_loops()
         waiting = {episode: np.flatnonzero(~finished) for episode, finished in done.items()}
-        given = shares(waiting, len(loops))
+        given = work_of_loops(waiting, len(loops))
         with ThreadPoolExecutor(len(loops)) as pool:
             running = [(loop, pool.submit(work, loop, s)) for loop, s in zip(loops, given, strict=True)]
         for loop, outcome in running:

@@ -36,10 +36,10 @@ def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float)
 
 
 def _cost(integrals: Integrals) -> Array:
-    share = integrals.sound_share
-    sound = (share >= 1.0) & np.isfinite(integrals.iae)
-    iae = np.where(sound, integrals.iae, 0.0)
-    return np.where(sound, _compressed(iae), LARGEST_IAE * (_DIVERGED - share))
+    fraction = integrals.finite_fraction
+    finite = (fraction >= 1.0) & np.isfinite(integrals.iae)
+    iae = np.where(finite, integrals.iae, 0.0)
+    return np.where(finite, _compressed(iae), LARGEST_IAE * (_DIVERGED - fraction))
 
 
 def _compressed(iae: Array) -> Array:
@@ -98,4 +98,4 @@ def _blocks(lanes: int, threads: int) -> list[slice]:
 
 
 def _joined(blocks: list[Integrals]) -> Integrals:
-    return Integrals(np.concatenate([b.iae for b in blocks]), np.concatenate([b.sound_share for b in blocks]))
+    return Integrals(np.concatenate([b.iae for b in blocks]), np.concatenate([b.finite_fraction for b in blocks]))

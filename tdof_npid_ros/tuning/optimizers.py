@@ -23,7 +23,7 @@ from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
 from tdof_npid_ros.tuning.hga import HGA
 
 INITIAL_STEP = 0.3
-"""CMA-ES's first standard deviation, as a share of the bounds' distance: what the library advises."""
+"""CMA-ES's first standard deviation, as a fraction of the bounds' distance: what the library advises."""
 
 
 def make_optimizer(

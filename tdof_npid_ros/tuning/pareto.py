@@ -175,7 +175,7 @@ def pareto_front(
     return Front(case, controller, ratio, gains, np.asarray(found.F[order], dtype=np.float64))
 
 
-def dominated_share(front: Front, other: Front) -> float:
+def dominated_fraction(front: Front, other: Front) -> float:
     """Share of the points of `front` that some point of `other` beats in both measures."""
     beats = np.all(other.iae[None, :, :] < front.iae[:, None, :], axis=2)
     return float(np.mean(np.any(beats, axis=1)))

@@ -84,7 +84,9 @@ class TuningProblem:
             try:
                 self.gains(np.array(corner))
             except GainsError as error:
-                raise TuningError(f"{self.case.name}: its bounds hold gains that no controller takes: {error}") from None
+                raise TuningError(
+                    f"{self.case.name}: its bounds hold gains that no controller takes: {error}"
+                ) from None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.operation import PLAIN
+from tdof_npid_ros.control.options import PLAIN
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"

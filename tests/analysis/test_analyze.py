@@ -280,12 +280,16 @@ def test_files_and_json(bag, tmp_path, capsys, case) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_the_page_works_in_a_browser(bag, tmp_path) -> None:
-    """Loaded from disk in a headless browser: both groups draw, a drag zooms, a checkbox hides, hovering tells values."""
+    """Loaded from disk in a headless browser: both groups draw, a drag zooms, a checkbox hides, hovering tells
+    values."""
     analyze([bag]).html(tmp_path / "a.html")
     steps = """
     const canvas = document.querySelector('canvas'), box = canvas.getBoundingClientRect();
-    const ink = c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.reduce((a, v, i) => a + (i % 4 == 3 && v > 0), 0);
-    const fire = (type, share) => canvas.dispatchEvent(new PointerEvent(type, {clientX: box.left + 62 + share * (box.width - 84), pointerId: 1}));
+    const ink = c =>
+      c.getContext('2d').getImageData(0, 0, c.width, c.height).data.reduce((a, v, i) => a + (i % 4 == 3 && v > 0), 0);
+    const at = fraction => box.left + 62 + fraction * (box.width - 84);
+    const fire = (type, fraction) =>
+      canvas.dispatchEvent(new PointerEvent(type, {clientX: at(fraction), pointerId: 1}));
     canvas.setPointerCapture = () => {};
     const found = {drawn: [...document.querySelectorAll('canvas')].map(ink), whole: [...groups[0].range]};
     fire('pointerdown', 0.2); fire('pointermove', 0.4); fire('pointerup', 0.4);

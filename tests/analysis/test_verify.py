@@ -11,7 +11,7 @@ from tdof_npid_ros.analysis.verify import NO_PARAMETERS, UNKNOWN_STATE
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.operation import PLAIN
+from tdof_npid_ros.control.options import PLAIN
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_a_bag_without_efforts_is_refused(tmp_path) -> None:
 
 def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_action(tmp_path, case) -> None:
     """A robot's loop, manual mode and a rate limit in between; joints by name."""
-    operation = PLAIN
+    options = PLAIN
     with LoopBag(tmp_path / "bag") as bag:
         bag.configuration(case, case.gains)
         controller = Controller(case.gains, case.sample_period_ns)
@@ -158,9 +158,9 @@ def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_actio
             if k == 0:
                 controller.begin_within(np.array([0.3]))
             if k in (100, 150):
-                operation = replace(operation, manual=k == 100, manual_effort=0.7, effort_rate=5.0)
+                options = replace(options, manual=k == 100, manual_effort=0.7, effort_rate=5.0)
                 bag.parameters("controller", {"manual": k == 100, "manual_effort": 0.7, "effort_rate": 5.0})
-                controller.change(case.gains, operation)
+                controller.change(case.gains, options)
             controller.answer(stamp, np.ones(1), y)
             begun = controller.integral_before if k == 0 else ()
             bag.write("output", JOINT_STATE, joint_state(stamp, "robot1/base_link", y, [0.3]))

@@ -21,7 +21,7 @@ from tdof_npid_ros.control.gains import (
     GainsError,
     gains_from_mapping,
 )
-from tdof_npid_ros.control.operation import PLAIN, Operation, operation_from_mapping
+from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
 
 H = 0.01  # s
 PERIOD_NS = 10_000_000
@@ -31,8 +31,8 @@ GAINS = Gains("tdof_npid2", kp=2.0, ki=1.5, kd=0.3, alpha=0.3, beta=0.2, sigma=0
 class Loop:
     """A controller on y' = u - y, which is slow enough that a jump of u stands out."""
 
-    def __init__(self, gains: Gains = GAINS, operation: Operation = PLAIN, setpoint: float = 1.0) -> None:
-        self.controller = Controller(gains, PERIOD_NS, operation)
+    def __init__(self, gains: Gains = GAINS, options: ControllerOptions = PLAIN, setpoint: float = 1.0) -> None:
+        self.controller = Controller(gains, PERIOD_NS, options)
         self.setpoint, self.y, self.k = setpoint, 0.0, 0
         self.efforts: list[float] = []
 
@@ -45,9 +45,9 @@ class Loop:
             self.k += 1
         return self.efforts[-steps:]
 
-    def change(self, gains: dict[str, Any] | None = None, **operation: Any) -> None:
-        values = self.controller.operation.as_dict() | operation
-        self.controller.change(self.controller.gains.with_values(**(gains or {})), Operation(**values))
+    def change(self, gains: dict[str, Any] | None = None, **options: Any) -> None:
+        values = self.controller.options.as_dict() | options
+        self.controller.change(self.controller.gains.with_values(**(gains or {})), ControllerOptions(**values))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_lifting_a_limit_or_a_rate_does_not_make_the_effort_jump() -> None:
     for lift in ({"effort_rate": math.inf}, {"effort_max": math.inf}):
         limited = {"effort_rate": 20.0} if "effort_rate" in lift else {}
         most = 4.0 if "effort_max" in lift else math.inf
-        loop = Loop(Gains("pid", kp=50.0, ki=5.0, effort_max=most), Operation(**limited), setpoint=10.0)
+        loop = Loop(Gains("pid", kp=50.0, ki=5.0, effort_max=most), ControllerOptions(**limited), setpoint=10.0)
         before = loop.run(20)[-1]
         gains = {name: value for name, value in lift.items() if name == "effort_max"}
         loop.change(gains, **{name: value for name, value in lift.items() if name == "effort_rate"})
@@ -131,7 +131,7 @@ def test_without_integral_action_there_is_nothing_to_track() -> None:
 
 
 def test_without_bumpless_a_change_acts_at_once() -> None:
-    loop = Loop(operation=Operation(bumpless=False))
+    loop = Loop(options=ControllerOptions(bumpless=False))
     before = loop.run(60)[-1]
     loop.change({"kp": 9.0})
     assert abs(loop.run(1)[0] - before) > 1.0
@@ -158,20 +158,22 @@ def test_manual_mode_and_bumpless_return() -> None:
 
 
 def test_manual_effort_keeps_the_limits() -> None:
-    loop = Loop(GAINS.with_values(effort_max=0.5), Operation(manual=True, manual_effort=3.0, effort_rate=10.0))
+    loop = Loop(GAINS.with_values(effort_max=0.5), ControllerOptions(manual=True, manual_effort=3.0, effort_rate=10.0))
     assert loop.run(8)[:6] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.5])
 
 
-@pytest.mark.parametrize("operation", [PLAIN, Operation(effort_rate=1e6), Operation(manual=True, manual_effort=9.0)])
-def test_every_lane_keeps_limits_of_its_own(operation: Operation) -> None:
+@pytest.mark.parametrize(
+    "options", [PLAIN, ControllerOptions(effort_rate=1e6), ControllerOptions(manual=True, manual_effort=9.0)]
+)
+def test_every_lane_keeps_limits_of_its_own(options: ControllerOptions) -> None:
     gains = Gains("pid", kp=5.0, effort_min=-1.0, effort_max=(0.5, 2.0, 7.0))
-    controller = Controller(gains, PERIOD_NS, operation)
+    controller = Controller(gains, PERIOD_NS, options)
     controller.answer(0, np.ones(3), np.zeros(3))
-    assert controller.effort.tolist() == [0.5, 2.0, 7.0 if operation.manual else 5.0]
+    assert controller.effort.tolist() == [0.5, 2.0, 7.0 if options.manual else 5.0]
     assert controller.saturated
     controller.answer(PERIOD_NS, np.ones(3), np.full(3, 3.0))
-    assert controller.effort.tolist() == ([0.5, 2.0, 7.0] if operation.manual else [-1.0] * 3)
-    if not operation.manual:
+    assert controller.effort.tolist() == ([0.5, 2.0, 7.0] if options.manual else [-1.0] * 3)
+    if not options.manual:
         controller.answer(2 * PERIOD_NS, np.ones(3), np.ones(3))
         assert not controller.saturated
 
@@ -183,7 +185,7 @@ def test_wrong_limits_of_lanes_are_refused(most: tuple[float, ...]) -> None:
 
 
 def test_setpoint_ramp_starts_from_the_output_and_keeps_its_rate() -> None:
-    ramped = Loop(Gains("pid", kp=1.0), Operation(setpoint_rate=2.0))
+    ramped = Loop(Gains("pid", kp=1.0), ControllerOptions(setpoint_rate=2.0))
     ramped.y = 0.5
     ramped.controller.answer(0, np.ones(1), np.array([0.5]))
     assert ramped.controller.effort[0] == pytest.approx(0.02)
@@ -193,7 +195,7 @@ def test_setpoint_ramp_starts_from_the_output_and_keeps_its_rate() -> None:
 
 
 def test_setpoint_limits() -> None:
-    loop = Loop(Gains("pid", kp=1.0), Operation(setpoint_min=-0.5, setpoint_max=0.25))
+    loop = Loop(Gains("pid", kp=1.0), ControllerOptions(setpoint_min=-0.5, setpoint_max=0.25))
     assert loop.run(1) == [0.25]
     loop.setpoint, loop.y = -3.0, 0.0
     assert loop.run(1) == [-0.5]
@@ -202,7 +204,8 @@ def test_setpoint_limits() -> None:
 def test_effort_rate_limit_holds_and_the_integral_does_not_wind_up() -> None:
     gains = Gains("pid", kp=5.0, ki=20.0, anti_windup="conditional")
     loop, wound_up = (
-        Loop(gains.with_values(anti_windup=kind), Operation(effort_rate=3.0)) for kind in ("conditional", "none")
+        Loop(gains.with_values(anti_windup=kind), ControllerOptions(effort_rate=3.0))
+        for kind in ("conditional", "none")
     )
     efforts = loop.run(1500)
     assert max(abs(np.diff([0.0, *efforts]))) <= 3.0 * H + 1e-12
@@ -211,7 +214,7 @@ def test_effort_rate_limit_holds_and_the_integral_does_not_wind_up() -> None:
 
 
 def test_dead_band_ignores_small_errors_without_a_step() -> None:
-    loop = Loop(Gains("pid", kp=10.0, ki=1.0), Operation(dead_band=0.1))
+    loop = Loop(Gains("pid", kp=10.0, ki=1.0), ControllerOptions(dead_band=0.1))
     for k, y in enumerate([0.91, 1.09, 1.0]):
         loop.controller.answer(k * PERIOD_NS, np.ones(1), np.array([y]))
         assert loop.controller.effort[0] == 0.0
@@ -220,7 +223,7 @@ def test_dead_band_ignores_small_errors_without_a_step() -> None:
 
 
 def test_measurement_filter_is_a_first_order_lag() -> None:
-    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, Operation(filter_time=0.1))
+    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, ControllerOptions(filter_time=0.1))
     controller.answer(0, np.zeros(1), np.zeros(1))
     for k in range(1, 11):
         controller.answer(k * PERIOD_NS, np.zeros(1), np.ones(1))
@@ -229,13 +232,13 @@ def test_measurement_filter_is_a_first_order_lag() -> None:
 
 @pytest.mark.parametrize(("r", "y", "error"), [(3.1, -3.1, -0.083185), (-3.1, 3.1, 0.083185), (7.0, 0.5, 0.216815)])
 def test_angles_go_the_shorter_way_round(r: float, y: float, error: float) -> None:
-    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, Operation(angle=True))
+    controller = Controller(Gains("pid", kp=1.0), PERIOD_NS, ControllerOptions(angle=True))
     controller.answer(0, np.array([r]), np.array([y]))
     assert controller.effort[0] == pytest.approx(error, abs=1e-6)
 
 
 def test_an_angle_passing_half_a_turn_gives_no_derivative_kick() -> None:
-    controller = Controller(Gains("tdof_npid2", kp=1.0, kd=1.0, alpha=0.5), PERIOD_NS, Operation(angle=True))
+    controller = Controller(Gains("tdof_npid2", kp=1.0, kd=1.0, alpha=0.5), PERIOD_NS, ControllerOptions(angle=True))
     efforts = []
     for k, angle in enumerate(np.arange(3.0, 3.3, 0.01)):
         wrapped = angle if angle < math.pi else angle - 2 * math.pi
@@ -283,23 +286,25 @@ def test_answers_depend_only_on_what_each_was_computed_with() -> None:
     ("values", "reason"),
     [
         ({"setpoint_rate": 0.0}, "above 0"), ({"effort_rate": -1.0}, "above 0"), ({"dead_band": -1.0}, "not below 0"),
-        ({"filter_time": math.inf}, "finite"), ({"manual": 1}, "true or false"), ({"manual_effort": math.inf}, "finite"),
+        ({"filter_time": math.inf}, "finite"), ({"manual": 1}, "true or "
+        "false"), ({"manual_effort": math.inf}, "finite"),
         ({"setpoint_min": 1.0, "setpoint_max": 0.0}, "need setpoint_min"), ({"setpoint_rate": math.nan}, "nan"),
     ],
 )  # fmt: skip
 def test_wrong_operation_is_refused(values: dict[str, Any], reason: str) -> None:
     with pytest.raises(GainsError, match=reason):
-        operation_from_mapping(values)
+        options_from_mapping(values)
 
 
 def test_manual_effort_must_fit_the_lanes() -> None:
     with pytest.raises(GainsError, match="2 lanes"):
-        Controller(GAINS.with_values(kp=(1.0, 2.0)), PERIOD_NS, Operation(manual_effort=(1.0, 2.0, 3.0)))
+        Controller(GAINS.with_values(kp=(1.0, 2.0)), PERIOD_NS, ControllerOptions(manual_effort=(1.0, 2.0, 3.0)))
 
 
 def test_every_operation_has_a_name_of_its_own() -> None:
     digests = {
-        parameters_digest(GAINS, PERIOD_NS, o) for o in (PLAIN, Operation(dead_band=0.1), Operation(manual=True))
+        parameters_digest(GAINS, PERIOD_NS, o)
+        for o in (PLAIN, ControllerOptions(dead_band=0.1), ControllerOptions(manual=True))
     }
     assert len(digests) == 3
 
@@ -309,7 +314,7 @@ import numpy as np
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import answer_lanes
-from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.control.shaping import shape_lanes
 
 def compiled():
@@ -324,9 +329,9 @@ controller.change_gains(Gains(type="pid", kp=3.0, ki=1.0, kd=0.1))
 controller.answer(1, y, y)
 controller.begin_within(y + 1.0)
 controller.answer(2, y, y)
-controller.change(Gains(kp=2.0, ki=1.0), Operation(setpoint_rate=1.0, effort_rate=2.0))
+controller.change(Gains(kp=2.0, ki=1.0), ControllerOptions(setpoint_rate=1.0, effort_rate=2.0))
 controller.answer(3, y, y)
-controller.change(Gains(kp=2.0, ki=1.0), Operation(manual=True))
+controller.change(Gains(kp=2.0, ki=1.0), ControllerOptions(manual=True))
 controller.answer(4, y, y)
 assert compiled() == before
 """
@@ -351,25 +356,25 @@ def test_no_effort_is_ever_infinite_or_nan(kind: ControllerType, anti_windup: An
             "tracking_time": float(rng.choice([0.0, 5e-324, 1e308])),
             "effort_max": float(rng.choice([1.0, math.inf])),
         }
-        operation = Operation(
+        options = ControllerOptions(
             filter_time=float(rng.choice([0.0, 5e-324, 1e308])),
             dead_band=float(rng.choice([0.0, 1e308])),
             setpoint_rate=float(rng.choice([5e-324, math.inf])),
             manual=bool(rng.random() < 0.1),
         )
-        controller = Controller(Gains(kind, anti_windup=anti_windup, **values), PERIOD_NS, operation)
+        controller = Controller(Gains(kind, anti_windup=anti_windup, **values), PERIOD_NS, options)
         if rng.random() < 0.5:
             controller.begin_within(np.array([rng.choice([-1e308, 1e308])]))
         for k in range(20):
             controller.answer(k * PERIOD_NS, np.array([rng.choice(signals)]), np.array([rng.choice(signals)]))
-            assert np.isfinite(controller.effort[0]) and np.isfinite(controller.terms).all(), (values, operation)
+            assert np.isfinite(controller.effort[0]) and np.isfinite(controller.terms).all(), (values, options)
 
 
 @pytest.mark.parametrize(
     ("low", "high"), [("effort_min", "effort_max"), ("integral_min", "integral_max"), ("setpoint_min", "setpoint_max")]
 )
 def test_limits_that_leave_no_finite_value_are_refused(low: str, high: str) -> None:
-    kind = operation_from_mapping if low == "setpoint_min" else gains_from_mapping
+    kind = options_from_mapping if low == "setpoint_min" else gains_from_mapping
     for limits in ({low: math.inf}, {high: -math.inf}, {low: math.inf, high: math.inf}):
         with pytest.raises(GainsError, match=f"{low} is"):
             kind(limits)

@@ -84,7 +84,8 @@ def test_the_three_actions_add_up() -> None:
     controller = Controller(gains, PERIOD_NS)
     for k, error in enumerate(errors):
         controller.answer(k * PERIOD_NS, np.zeros(1), np.array([-error]))
-        p, i, d, raw = (controller.terms[TERMS.index(t), 0] for t in ("proportional", "integral", "derivative", "unlimited_effort"))  # fmt: skip
+        p, i, d, raw = (controller.terms[TERMS.index(t), 0] for t in ("proportional", "integral", "derivative",
+        "unlimited_effort"))  # fmt: skip
         assert controller.effort[0] == raw == p + i + d
 
 

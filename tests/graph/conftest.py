@@ -29,7 +29,7 @@ from typing import IO, Any
 
 import pytest
 
-from tdof_npid_ros.graph.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
 
 

@@ -19,7 +19,7 @@ import pytest
 from test_operation import CONTROLLER, PLANT, Live
 
 from tdof_npid_ros.analysis.verify import verify
-from tdof_npid_ros.graph.node import as_float, first
+from tdof_npid_ros.graph.runtime.node import as_float, first
 
 BOUND = 0.5  # of the setpoint: how far the output may go in any of these faults, but for the loss of the plant itself
 JUMP = 0.25  # largest step of the effort between two samples while parameters change at random
@@ -259,7 +259,8 @@ def test_random_parameters_of_every_node_are_accepted_or_refused_whole(graph: An
     graph.wait_for_nodes(name)
     names = list(graph.call(f"{name}/list_parameters", ListParameters, again=True).result.names)
     rng = random.Random(node)
-    wild = [None, True, 0, -7, 2**62, 0.5, -1.0, 1e300, math.nan, -math.inf, "", "x", [b"x", b"y"], [], [True], [0, 1], [1.0],
+    wild = [None, True, 0, -7, 2**62, 0.5, -1.0, 1e300, math.nan, -math.inf, "", "x", [b"x", b"y"], [], [True], [0, 1],
+    [1.0],
             [math.nan], ["0 setpoint 1", "1 end"], ["a", ""]]  # fmt: skip
     for _ in range(CHANGES):
         changes = {one: rng.choice(wild) for one in rng.sample(names, rng.choice([1, 1, 2, 3]))}

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.case import config_folder, load_case
-from tdof_npid_ros.control.operation import Operation
-from tdof_npid_ros.parameter_names import OF_ANY_NODE, OF_NODE, WITH_ANY_END
+from tdof_npid_ros.control.options import ControllerOptions
+from tdof_npid_ros.parameters import OF_ANY_NODE, OF_NODE, WITH_ANY_END
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import parse_plan
 
@@ -89,9 +89,9 @@ def test_distributed_equals_local_with_lanes(graph: Any) -> None:
 
 
 def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> None:
-    operation = {"setpoint_rate": 2.0, "effort_rate": 50.0, "dead_band": 0.01, "filter_time": 0.02, "setpoint_max": 0.9}
-    y, u = run_short(graph, "p1-c0.5", **operation)
-    local = dataclasses.replace(load_short("p1-c0.5"), operation=Operation(**operation)).simulate("short")
+    options = {"setpoint_rate": 2.0, "effort_rate": 50.0, "dead_band": 0.01, "filter_time": 0.02, "setpoint_max": 0.9}
+    y, u = run_short(graph, "p1-c0.5", **options)
+    local = dataclasses.replace(load_short("p1-c0.5"), options=ControllerOptions(**options)).simulate("short")
     assert np.array_equal(y, local.output)
     assert np.array_equal(u, local.control_effort)
 
@@ -130,7 +130,7 @@ def test_ctrl_c_again_and_again_while_a_tuner_ends(graph: Any) -> None:
 
 OUTLIVED = """
 import rclpy
-from tdof_npid_ros.graph.plant_node import PlantNode
+from tdof_npid_ros.graph.plant.node import PlantNode
 rclpy.init()
 stays = rclpy.create_node("stays")
 node = PlantNode()
@@ -158,7 +158,9 @@ def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) 
         assert process.stdout.readline() == "destroyed\n"
         with graph.newcomer() as newcomer:
             left = {"stays"}
-            graph.wait_until(lambda: {"stays", "plant"} & set(newcomer.get_node_names()) == left, 30, "the plant's leaving")
+            graph.wait_until(
+                lambda: {"stays", "plant"} & set(newcomer.get_node_names()) == left, 30, "the plant's leaving"
+            )
         assert process.poll() is None
         process.communicate("\n", timeout=30)
     assert process.returncode == 0
@@ -166,7 +168,7 @@ def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) 
 
 STUCK = """
 import ctypes, sys
-from tdof_npid_ros.graph.node import LoopNode, run_node
+from tdof_npid_ros.graph.runtime.node import LoopNode, run_node
 
 class Stuck(LoopNode):
     def destroy_node(self):
@@ -216,8 +218,8 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
 
-    from tdof_npid_ros.graph.messages import plan_message
-    from tdof_npid_ros.graph.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.messages import plan_message
+    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
 
     graph.start("controller")
     plan = load_case("p1-c0.5").plans["setpoint"]
@@ -226,7 +228,10 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
     output.header.frame_id = f"{plan.digest}/1"
     graph.publisher("output", JointState).publish(output)
     graph.publish_until(
-        plans, plan_message(plan, 0), lambda: graph.fact("/controller", "steps") == "1", what="an answer that nobody hears"
+        plans,
+        plan_message(plan, 0),
+        lambda: graph.fact("/controller", "steps") == "1",
+        what="an answer that nobody hears",
     )
     efforts = graph.collect("control_effort", JointState)
     graph.wait_until(lambda: efforts, what="the same answer")
@@ -287,8 +292,8 @@ def test_the_names_that_no_node_warns_of_are_the_parameters_that_the_nodes_have(
 def test_what_a_plant_cannot_do_is_refused_and_it_goes_on(graph: Any) -> None:
     from trajectory_msgs.msg import JointTrajectory
 
-    from tdof_npid_ros.graph.messages import plan_message
-    from tdof_npid_ros.graph.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.messages import plan_message
+    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
 
     plant = graph.start("plant", model="third_order", mode="lockstep")
     graph.wait_for_nodes("/plant")
@@ -308,8 +313,8 @@ def test_a_lockstep_plant_that_is_activated_again_begins_anew(graph: Any) -> Non
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
 
-    from tdof_npid_ros.graph.messages import plan_message
-    from tdof_npid_ros.graph.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.messages import plan_message
+    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
 
     outputs = graph.collect("output", JointState)
     graph.start("plant", mode="lockstep", case="p1-c0.5")

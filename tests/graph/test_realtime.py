@@ -1,4 +1,5 @@
-"""The realtime plant keeps time: absolute schedule, missed ticks, speed, figures in the diagnostics, an idle tick's cost."""
+"""The realtime plant keeps time: absolute schedule, missed ticks, speed, figures in the diagnostics, an idle tick's
+cost."""
 
 from __future__ import annotations
 

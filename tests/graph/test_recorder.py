@@ -1,4 +1,5 @@
-"""The recorder: nothing is lost, a bag explains itself, is never overwritten, and disk trouble does not stop the loop."""
+"""The recorder: nothing is lost, a bag explains itself, is never overwritten, and disk trouble does not stop the
+loop."""
 
 from __future__ import annotations
 

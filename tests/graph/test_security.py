@@ -16,7 +16,7 @@ from loop_bags import LoopBag
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.graph.__main__ import NODES
-from tdof_npid_ros.graph.recorder_node import EXPECTED as EXPECTED_BY_RECORDER
+from tdof_npid_ros.graph.recorder.node import EXPECTED as EXPECTED_BY_RECORDER
 
 OWN_PARAMETERS = {"/parameter_events"}  # every node may listen to its own clock parameter; not all versions of rclpy do
 # Ways to run a node that, together, use all that its policy allows. BAG is a bag that the test makes.

@@ -82,7 +82,7 @@ class LiveTuner:
     def pool(
         self, which: TuningProblem, loops: list[str], loop_timeout: float = 60.0, answer_timeout: float = 1.5
     ) -> Any:
-        from tdof_npid_ros.graph.loop_pool import LoopPool
+        from tdof_npid_ros.graph.tuner.loop_pool import LoopPool
 
         pool = LoopPool(self.node, which, loops, loop_timeout, answer_timeout, lambda: None)
         self._pools.append(pool)
@@ -280,7 +280,7 @@ def test_a_silent_loop_ends_the_tuning_with_the_reason(loops: Any, tuner: LiveTu
 CAREFUL_CONTROLLER = """
 import sys
 from tdof_npid_ros.graph.controller_node import ControllerNode
-from tdof_npid_ros.graph.node import run_node
+from tdof_npid_ros.graph.runtime.node import run_node
 
 class CarefulController(ControllerNode):
     def checked(self, changes):
@@ -370,7 +370,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     from rclpy.parameter import parameter_value_to_python
     from sensor_msgs.msg import JointState
 
-    from tdof_npid_ros.graph.alternate_loop import AlternateLoop
+    from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
     from tdof_npid_ros.tuning.alternate import StepTest
 
     coarse = {"sample_period": 0.05, "mode": "realtime"}
@@ -385,7 +385,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     loop = AlternateLoop(tuner.node, which, test, "/real", 60.0, 5.0, lambda: None)
     study = Study(which)
     loops.publisher("/real/output", JointState).publish(JointState())  # malformed; nobody stumbles over it
-    run = threading.Thread(target=lambda: (study.run(loop.evaluate), loop.leave(study.result.gains)))
+    run = threading.Thread(target=lambda: (study.run(loop.evaluate), loop.restore(study.result.gains)))
     run.start()
     loops.wait_until(lambda: not run.is_alive(), 90, "the end of the tuning")
 
@@ -400,5 +400,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
         assert all(low <= value <= high for value in applied[name])
     gains = study.result.gains
     assert loops.get_parameters("/real/controller", "kp", "ki", "kd") == [gains.kp, gains.ki, gains.kd]
-    assert 2.0 < max(abs(m.position[0]) for m in outputs if m.position) < 5.0  # one at least was aborted, soon after it left -1 .. 2
+    assert (
+        2.0 < max(abs(m.position[0]) for m in outputs if m.position) < 5.0
+    )  # one at least was aborted, soon after it left -1 .. 2
     assert study.best_value < 5.0

@@ -14,7 +14,7 @@ from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import StepTest, Trial
 from tdof_npid_ros.tuning.ask_tell import Array
-from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError, integrals_of, measure, shares
+from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError, integrals_of, measure, work_of_loops
 from tdof_npid_ros.tuning.objective import Objective, objective_values
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
 
@@ -61,9 +61,9 @@ def test_integrals_from_outputs_are_those_of_the_compiled_loop_bit_for_bit() -> 
         compiled = CASE.integrals(episode, gains)
         measured = integrals_of(CASE.signals[episode], CASE.simulate(episode, gains).output)
         assert np.array_equal(measured.iae, compiled.iae)
-        assert np.array_equal(measured.sound_share, compiled.sound_share)
-        assert (compiled.sound_share[:-1] == 1).any()
-        assert compiled.sound_share[-1] < 1
+        assert np.array_equal(measured.finite_fraction, compiled.finite_fraction)
+        assert (compiled.finite_fraction[:-1] == 1).any()
+        assert compiled.finite_fraction[-1] < 1
 
 
 @pytest.mark.parametrize("loops", [1, 2, 3, 5])
@@ -83,7 +83,7 @@ def test_what_a_lost_loop_leaves_undone_the_others_do(good_for: int) -> None:
 def test_each_candidate_runs_each_episode_once() -> None:
     for count, loops in [(1, 1), (5, 1), (5, 2), (5, 3), (2, 7), (40, 4)]:
         waiting = {"setpoint": np.arange(count), "disturbance": np.arange(1, count)}
-        given = shares(waiting, loops)
+        given = work_of_loops(waiting, loops)
         assert len(given) == loops
         for episode, wanted in waiting.items():
             parts = [part for share in given for name, part in share if name == episode]
@@ -91,7 +91,7 @@ def test_each_candidate_runs_each_episode_once() -> None:
 
 
 def test_two_loops_run_an_episode_each() -> None:
-    first, second = shares({"setpoint": np.arange(6), "disturbance": np.arange(6)}, 2)
+    first, second = work_of_loops({"setpoint": np.arange(6), "disturbance": np.arange(6)}, 2)
     assert [name for name, _ in first] == ["setpoint"]
     assert [name for name, _ in second] == ["disturbance"]
 

@@ -20,8 +20,8 @@ CASE = replace(load_case("p3-c1"), episodes=SHORT)
 PROBLEM = TuningProblem(CASE, "tdof_npid2")
 
 
-def integrals(iae: list[float], sound_share: list[float]) -> Integrals:
-    return Integrals(np.array(iae), np.array(sound_share))
+def integrals(iae: list[float], finite_fraction: list[float]) -> Integrals:
+    return Integrals(np.array(iae), np.array(finite_fraction))
 
 
 def candidates(count: int) -> Array:

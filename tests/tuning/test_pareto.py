@@ -14,7 +14,7 @@ from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, TUNED
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.pareto import Front, dominated_share, foptd_case, pareto_front
+from tdof_npid_ros.tuning.pareto import Front, dominated_fraction, foptd_case, pareto_front
 
 RATIO = 0.5
 SHORT = ["pareto", "--ratio", "0.5", "--generations", "3"]
@@ -28,7 +28,7 @@ def fronts() -> dict[str, Front]:
 def test_no_point_of_a_front_beats_another(fronts: dict[str, Front]) -> None:
     for front in fronts.values():
         assert len(front.gains) > 10
-        assert dominated_share(front, front) == 0.0
+        assert dominated_fraction(front, front) == 0.0
         assert (np.diff(front.iae[:, 0]) >= 0).all()
         assert (np.diff(front.iae[:, 1]) <= 0).all()
 
@@ -50,8 +50,8 @@ def test_a_point_is_what_its_gains_give(fronts: dict[str, Front]) -> None:
 def test_the_paper_s_order_of_the_controllers(fronts: dict[str, Front]) -> None:
     pid = fronts["pid"]
     for kind in CONTROLLER_TYPES[1:]:
-        assert dominated_share(pid, fronts[kind]) > 0.9
-        assert dominated_share(fronts[kind], pid) < 0.1
+        assert dominated_fraction(pid, fronts[kind]) > 0.9
+        assert dominated_fraction(fronts[kind], pid) < 0.1
     least = {kind: front.iae.sum(axis=1).min() for kind, front in fronts.items()}
     assert least["tdof_npid2"] < least["npid"] < least["pid"]
     assert least["tdof_npid2"] == pytest.approx(least["tdof_npid1"], rel=0.02)

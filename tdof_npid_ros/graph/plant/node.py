@@ -12,15 +12,15 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.case import changeable_parameters, sample_period_in_ns
 from tdof_npid_ros.control.joints import Joints
-from tdof_npid_ros.graph.loop_end import TIMING_RANGES, LoopEnd
-from tdof_npid_ros.graph.messages import lane_names
-from tdof_npid_ros.graph.node import number, run_node
-from tdof_npid_ros.graph.plant_lockstep import LockstepPlant
-from tdof_npid_ros.graph.plant_realtime import RealtimePlant
+from tdof_npid_ros.graph.plant.lockstep import LockstepPlant
+from tdof_npid_ros.graph.plant.realtime import RealtimePlant
+from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd
+from tdof_npid_ros.graph.runtime.messages import lane_names
+from tdof_npid_ros.graph.runtime.node import number, run_node
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
-from tdof_npid_ros.signals import Sample, SignalWriter
+from tdof_npid_ros.wire import Sample, SignalWriter
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 FALLBACKS = ("effort", "hold")
@@ -102,13 +102,13 @@ class PlantNode(LoopEnd):
 
     def takes(self, topic: str, effort: np.ndarray) -> bool:
         """Whether there is one finite value per lane; else it is refused."""
-        return self.is_sound(topic, effort, self.simulator.lanes, sys.float_info.max)
+        return self.is_valid(topic, effort, self.simulator.lanes, sys.float_info.max)
 
     def effort_of(self, sample: Sample) -> np.ndarray | None:
         """The control effort, (lanes,), by the joints' names where it bears them; None if it is refused."""
         effort = sample.effort
         if self.joints.names and set(sample.name) == set(self.joints.names):
-            effort = self.joints.picked(sample.name, effort)
+            effort = self.joints.selected(sample.name, effort)
         return effort if self.takes("control_effort", effort) else None
 
     def plant_at(self, changes: dict[str, float]) -> Plant:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from rclpy.qos import QoSProfile
 
-from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.messages import all_within
-from tdof_npid_ros.graph.node import RECENT, RECENT_QOS, LoopNode
-from tdof_npid_ros.graph.timing import prepare_for_realtime
+from tdof_npid_ros.graph.runtime.endpoints import signal_qos
+from tdof_npid_ros.graph.runtime.messages import all_within
+from tdof_npid_ros.graph.runtime.node import RECENT, RECENT_QOS, LoopNode
+from tdof_npid_ros.graph.runtime.realtime import prepare_for_realtime
 
 PATIENCE_PERIODS = 3  # without a signal: no silence yet, however slow the loop
 TIMING_RANGES = {"deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}  # s
@@ -29,7 +29,9 @@ class LoopEnd(LoopNode):
     def declare_timing(self, published: str, taken: str) -> None:
         """Declare the parameters of what the topic `published` promises, `taken` has to, and the processor allows."""
         declare = self.declare_value
-        declare("deadline", 0.0, f"realtime: s from one {published} to the next, as it promises; 0: no promise", fixed=True)
+        declare(
+            "deadline", 0.0, f"realtime: s from one {published} to the next, as it promises; 0: no promise", fixed=True
+        )
         declare("lease", 1.0, f"s; lease of the liveliness that {published} promises; 0: no promise", fixed=True)
         declare(
             "request_deadline",
@@ -56,7 +58,7 @@ class LoopEnd(LoopNode):
         p = self.values_of(["deadline", "lease", "request_deadline"])
         return signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else RECENT_QOS
 
-    def is_sound(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
+    def is_valid(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
         """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""
         if len(values) != lanes:
             self.refuse("rejected", f"{topic} refused", f": it has {len(values)} values for {lanes} lanes")

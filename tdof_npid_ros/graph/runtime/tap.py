@@ -18,7 +18,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from tdof_npid_ros.signals import SignalReader
+from tdof_npid_ros.wire import SignalReader
 
 SHORTEST_PAUSE = 0.005  # s between two looks while messages come
 LONGEST_PAUSE = 0.1  # s between two looks while nothing comes; DDS keeps 5000 messages for each subscription

@@ -7,7 +7,7 @@ from dataclasses import fields
 from difflib import get_close_matches
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE
-from tdof_npid_ros.control.operation import Operation
+from tdof_npid_ros.control.options import ControllerOptions
 
 # What a file may give to all nodes of a loop, and so to a node that needs only some of them.
 OF_ANY_NODE = ("sample_period", "mode", "speed", "lanes", "joint_names", "lossless", "autostart",
@@ -16,7 +16,7 @@ OF_ANY_NODE = ("sample_period", "mode", "speed", "lanes", "joint_names", "lossle
 OF_NODE = {  # besides; the parameters of the plant's model come to this
     "plant": ("model", "effort_min", "effort_max", "reply_timeout", "retries", "publish_clock", "effort_timeout",
               "fallback", "fallback_effort", "return_time"),
-    "controller": (*GAIN_NAMES, *(field.name for field in fields(Operation)),
+    "controller": (*GAIN_NAMES, *(field.name for field in fields(ControllerOptions)),
                    "setpoint", "hold_output", "output_timeout", "save_i_term"),
     "scenario": ("play", "episodes"),
     "tuner": (*(f"bounds.{gain}" for gain in PER_LANE), "case", "type", "free", "weight", "algorithm", "seed",
@@ -28,7 +28,8 @@ WITH_ANY_END = ("plan.", "qos_overrides.")
 
 
 def unknown_parameters(given: Iterable[str], known: Collection[str]) -> list[str]:
-    """What to warn of: names that a file gives to a node that does not know them, and that are none of `OF_ANY_NODE`."""
+    """What to warn of: names that a file gives to a node that does not know them, and that are none of
+    `OF_ANY_NODE`."""
     warnings = []
     for name in given:
         if name not in known and name not in OF_ANY_NODE and not name.startswith(WITH_ANY_END):

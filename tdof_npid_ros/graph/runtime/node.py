@@ -24,13 +24,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from tdof_npid_ros.graph.ending import end_within
-from tdof_npid_ros.graph.endpoints import Endpoints, signal_qos
-from tdof_npid_ros.graph.messages import diagnostics_message
-from tdof_npid_ros.graph.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.timing import collect_garbage
-from tdof_npid_ros.parameter_names import unknown_parameters
-from tdof_npid_ros.signals import Sample, SignalReader
+from tdof_npid_ros.graph.runtime.ending import end_within
+from tdof_npid_ros.graph.runtime.endpoints import Endpoints, signal_qos
+from tdof_npid_ros.graph.runtime.messages import diagnostics_message
+from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.realtime import collect_garbage
+from tdof_npid_ros.parameters import unknown_parameters
+from tdof_npid_ros.wire import Sample, SignalReader
 
 SIGNAL_QOS = signal_qos(1000)
 RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
@@ -98,7 +98,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def destroy_node(self) -> None:
         """As `Node.destroy_node`, and leave the DDS domain.
 
-        rclpy forgets a managed node's state machine, which would keep the node in the domain until the process has ended.
+        rclpy forgets a managed node's state machine, which would keep the node in the domain until the process has
+        ended.
         """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
@@ -141,7 +142,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
         self.subscribe(JointState, topic, on_data, qos, sole, raw=True)
 
-    # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due before.
+    # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due
+    # before.
 
     def create_subscription(
         self, message_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
@@ -358,7 +360,12 @@ def as_float(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text, in quotes if it looks like a number"}
+KINDS = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text, in quotes if it looks like a number",
+}
 
 
 def check_kind(name: str, value: Any, default: Any) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tdof_npid_ros.graph.node import SIGNAL_QOS, LoopNode
-from tdof_npid_ros.signals import Sample
+from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS, LoopNode
+from tdof_npid_ros.wire import Sample
 
 TOPIC = "recorded"
 WINDOW = 600  # steps; publishers keep 1000 messages

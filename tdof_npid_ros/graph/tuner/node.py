@@ -19,12 +19,10 @@ from tqdm import tqdm
 
 from tdof_npid_ros.case import Case, controller_type, load_case, read_bounds
 from tdof_npid_ros.control.gains import PER_LANE, Gains
-from tdof_npid_ros.graph.alternate_loop import AlternateLoop
-from tdof_npid_ros.graph.ending import end_within
-from tdof_npid_ros.graph.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
-from tdof_npid_ros.graph.messages import signal_message
-from tdof_npid_ros.graph.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.node import (
+from tdof_npid_ros.graph.runtime.ending import end_within
+from tdof_npid_ros.graph.runtime.messages import signal_message
+from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.node import (
     ERROR,
     LATCHED_QOS,
     LEAVE_TIMEOUT,
@@ -36,6 +34,8 @@ from tdof_npid_ros.graph.node import (
     ignore_further_signals,
     number,
 )
+from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
+from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.parameter_file import ParameterFileError, check_replaceable, write_parameters
 from tdof_npid_ros.tuning.alternate import StepTest
@@ -65,7 +65,7 @@ class Evaluator(Protocol):
         """Values (n,) of candidates (n, gains)."""
         ...
 
-    def leave(self, gains: Gains | None) -> None:
+    def restore(self, gains: Gains | None) -> None:
         """Set these gains, or those before the tuning."""
         ...
 
@@ -174,7 +174,7 @@ class TunerNode(LoopNode):
         safe_output = self._declare_pair("safe_range.output", [-math.inf, math.inf], "alternate: ends a trial if left")
         safe_effort = self._declare_pair("safe_range.effort", [-math.inf, math.inf], "alternate: ends a trial if left")
         settle_band = self.declare_value(
-            "settle_band", 0.02, "alternate: share of the step, counts as there", fixed=True
+            "settle_band", 0.02, "alternate: fraction of the step, counts as there", fixed=True
         )
         settle_time = self._declare_seconds("settle_time", 1.0, "alternate: s within settle_band, counts as settled")
         time_limit = self._declare_seconds("time_limit", 60.0, "alternate: s in which the output must settle")
@@ -221,7 +221,7 @@ class TunerNode(LoopNode):
                 self._confirm()
         finally:
             self.stop_requested = self.stop_at_once = False
-            self.evaluator.leave(self.study.result.gains if self.study.generation else None)
+            self.evaluator.restore(self.study.result.gains if self.study.generation else None)
         if self.study.done:
             self._write_result()
             self.report("finished", f"finished: best {self.study.best_value:.6g}")
@@ -234,7 +234,8 @@ class TunerNode(LoopNode):
         self.stop_requested = True
 
     def check_interrupted(self) -> None:
-        """Raise InterruptedTuningError if asked to stop at once, or to stop and no loop is left to end the generation."""
+        """Raise InterruptedTuningError if asked to stop at once, or to stop and no loop is left to end the
+        generation."""
         if self.stop_at_once or (self.stop_requested and self.activated.is_set() and not self.evaluator.in_use):
             raise InterruptedTuningError(self._interrupted())
 

@@ -14,17 +14,17 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_candidates, gains_from_mapping
-from tdof_npid_ros.graph.messages import plan_message
-from tdof_npid_ros.graph.node import LATCHED_QOS
-from tdof_npid_ros.graph.remote_node import RemoteNode
-from tdof_npid_ros.graph.tap import Taken, Tap, TapThread
+from tdof_npid_ros.graph.runtime.messages import plan_message
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
+from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import JOINT_STATE, SignalReader
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError
 from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.wire import JOINT_STATE, SignalReader
 
 ATTEMPTS = 5  # at an episode that something else cuts short
 POLL = 0.1  # s between two looks at an episode's progress

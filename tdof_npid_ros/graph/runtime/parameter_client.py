@@ -11,7 +11,7 @@ from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from tdof_npid_ros.graph.node import plain
+from tdof_npid_ros.graph.runtime.node import plain
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.live import LoopLostError
 

@@ -28,9 +28,13 @@ class LatestTimes:
         """Percentiles in microseconds, for the diagnostics."""
         if not self._count:
             return {}
-        times = np.sort(self._times[: self._count])  # np.percentile takes ten times as long when it is not in the caches
+        times = np.sort(
+            self._times[: self._count]
+        )  # np.percentile takes ten times as long when it is not in the caches
         last = len(times) - 1
-        return {f"{name}_{key}_us": f"{times[round(share * last)] / 1e3:.1f}" for key, share in PERCENTILES.items()}
+        return {
+            f"{name}_{key}_us": f"{times[round(fraction * last)] / 1e3:.1f}" for key, fraction in PERCENTILES.items()
+        }
 
 
 def prepare_for_realtime(priority: int, cpu: int) -> list[str]:
@@ -54,7 +58,8 @@ def prepare_for_realtime(priority: int, cpu: int) -> list[str]:
                 os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except OSError as error:
             refusals.append(
-                f"priority {priority} not taken ({error.strerror}): allow it with `rtprio 99` in /etc/security/limits.conf"
+                f"priority {priority} not taken ({error.strerror}): allow it with `rtprio 99` in "
+                "/etc/security/limits.conf"
             )
     if cpu >= 0:
         try:

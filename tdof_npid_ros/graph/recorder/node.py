@@ -27,12 +27,12 @@ from tdof_npid_ros.bag.cdr import without_padding
 from tdof_npid_ros.bag.file_writer import COMPRESSIONS
 from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
-from tdof_npid_ros.graph.lossless import NO_LOG, TOPIC
-from tdof_npid_ros.graph.messages import set_stamp, signal_message
-from tdof_npid_ros.graph.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
-from tdof_npid_ros.graph.snapshot import ParameterSnapshots
-from tdof_npid_ros.graph.tap import LogProgress, Taken, Tap, TapThread, message_class
-from tdof_npid_ros.signals import JOINT_STATE
+from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
+from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
+from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread, message_class
+from tdof_npid_ros.wire import JOINT_STATE
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
 CALM_DISCOVERY_PERIOD = 0.5  # s, when it does not
@@ -80,7 +80,8 @@ class RecorderNode(LoopNode):
             self.declare_value(
                 "topics",
                 EVERYTHING,
-                "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace",
+                "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this "
+                "namespace",
                 fixed=True,
             )
         )

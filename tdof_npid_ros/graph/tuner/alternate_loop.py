@@ -12,10 +12,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
-from tdof_npid_ros.graph.loop_client import tuned_parameters
-from tdof_npid_ros.graph.messages import signal_message, stamp_ns
-from tdof_npid_ros.graph.node import SIGNAL_QOS
-from tdof_npid_ros.graph.remote_node import RemoteNode
+from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
+from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS
+from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
+from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
@@ -93,7 +93,7 @@ class AlternateLoop:
             self._begin()
         return np.array([self._evaluate_one(candidate) for candidate in candidates])
 
-    def leave(self, gains: Gains | None) -> None:
+    def restore(self, gains: Gains | None) -> None:
         """Set these gains, or the last good ones."""
         if self._good is not None:
             try:
@@ -131,7 +131,7 @@ class AlternateLoop:
         else:
             self._node.get_logger().warning(f"candidate {candidate.tolist()} was {trial.outcome}: back to good gains")
             self._recover()
-        result = Integrals(np.array([trial.iae]), np.array([trial.share]))
+        result = Integrals(np.array([trial.iae]), np.array([trial.fraction]))
         nothing = Integrals(np.zeros(1), np.ones(1))
         value = float(objective_values(result, nothing, 0.0)[0])
         if trial.outcome == "measured" and value < self._best:

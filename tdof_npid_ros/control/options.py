@@ -13,7 +13,7 @@ from tdof_npid_ros.control.gains import Gains, GainsError, Lanes, check_limits, 
 
 
 @dataclass(frozen=True)
-class Operation:
+class ControllerOptions:
     """How the law is operated, valid as a whole or refused. By default nothing is done to setpoint, output and effort.
 
     Attributes:
@@ -81,14 +81,14 @@ class Operation:
 
 
 SWITCHES = ("manual", "angle", "bumpless")
-PLAIN = Operation()
-OPERATION_NAMES = tuple(field.name for field in fields(Operation))
+PLAIN = ControllerOptions()
+OPTION_NAMES = tuple(field.name for field in fields(ControllerOptions))
 
 
-def operation_from_mapping(values: Mapping[str, Any]) -> Operation:
-    """The operation from parameters by name; other parameters in `values` are passed over.
+def options_from_mapping(values: Mapping[str, Any]) -> ControllerOptions:
+    """The options from parameters by name; other parameters in `values` are passed over.
 
     Raises:
         GainsError: a value has the wrong type or range.
     """
-    return Operation(**{name: values[name] for name in OPERATION_NAMES if name in values})
+    return ControllerOptions(**{name: values[name] for name in OPTION_NAMES if name in values})

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tdof_npid_ros.signals import JOINT_STATE, NO_VALUES, SECOND, Sample, SignalReader, SignalWriter
+from tdof_npid_ros.wire import JOINT_STATE, NO_VALUES, SECOND, Sample, SignalReader, SignalWriter
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tdof_npid_ros.graph.endpoints import signal_qos
-from tdof_npid_ros.graph.loop_end import patience_ns
-from tdof_npid_ros.graph.node import ERROR, OK, STEADY, WARN
-from tdof_npid_ros.graph.timing import LatestTimes
+from tdof_npid_ros.graph.runtime.endpoints import signal_qos
+from tdof_npid_ros.graph.runtime.loop_end import patience_ns
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.realtime import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
-from tdof_npid_ros.signals import Sample
+from tdof_npid_ros.wire import Sample
 
 if TYPE_CHECKING:
-    from tdof_npid_ros.graph.plant_node import PlantNode
+    from tdof_npid_ros.graph.plant.node import PlantNode
 
 
 class RealtimePlant:

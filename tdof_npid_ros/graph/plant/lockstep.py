@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from rosgraph_msgs.msg import Clock as ClockMessage
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.graph.lossless import Log
-from tdof_npid_ros.graph.messages import plan_from_message, set_stamp
-from tdof_npid_ros.graph.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
+from tdof_npid_ros.graph.recorder.lossless import Log
+from tdof_npid_ros.graph.runtime.messages import plan_from_message, set_stamp
+from tdof_npid_ros.graph.runtime.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import Sample
+from tdof_npid_ros.wire import Sample
 
 if TYPE_CHECKING:
-    from tdof_npid_ros.graph.plant_node import PlantNode
+    from tdof_npid_ros.graph.plant.node import PlantNode
 
 Phase = Literal["waiting", "running", "stopped", "finished"]
 CLOCK_PERIOD = 0.05  # s of wall time between two /clock messages
@@ -78,11 +78,7 @@ class LockstepPlant:
 
     def _on_answer(self, answer: Sample) -> None:
         node, episode = self._node, self.episode
-        if (
-            episode is None
-            or self.phase == "finished"
-            or not episode.awaits(answer.stamp_ns, answer.frame_id)
-        ):
+        if episode is None or self.phase == "finished" or not episode.awaits(answer.stamp_ns, answer.frame_id):
             node.counts["late"] += 1
             return
         effort = node.effort_of(answer)

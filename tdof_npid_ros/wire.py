@@ -1,6 +1,8 @@
-"""The loop's signals as they are on the wire: sensor_msgs/msg/JointState in CDR, read and written without rclpy's message.
+"""The loop's signals as they are on the wire: sensor_msgs/msg/JointState in CDR, read and written without rclpy's
+message.
 
-To build that message, and to take it apart, costs rclpy more than a step of the loop costs plant and controller together.
+To build that message, and to take it apart, costs rclpy more than a step of the loop costs plant and controller
+together.
 What turns at every step goes this way; everything else publishes ordinary messages.
 """
 

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.graph.loop_client import LoopClient, WrongCaseError
+from tdof_npid_ros.graph.tuner.loop_client import LoopClient, WrongCaseError
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import LoopLostError, measure
@@ -94,7 +94,7 @@ class LoopPool:
         setpoint, disturbance = measure(candidates, self._usable, self._on_lost)
         return objective_values(setpoint, disturbance, self._problem.weight)
 
-    def leave(self, gains: Gains | None) -> None:
+    def restore(self, gains: Gains | None) -> None:
         """Set these gains, or those before the tuning, and one lane on every loop in use."""
         for namespace in self.in_use:
             loop = self._loops[namespace]

@@ -13,7 +13,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tdof_npid_ros.compiled import entry_point
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.signals import SECOND
+from tdof_npid_ros.wire import SECOND
 
 NAMED_LANES = 8  # more are read by programs, which go by the place
 

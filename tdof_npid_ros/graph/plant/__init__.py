@@ -1,0 +1,1 @@
+"""The plant node and its two ways of running: lockstep and realtime."""

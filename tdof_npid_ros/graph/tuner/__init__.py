@@ -1,0 +1,1 @@
+"""The tuner node and the loops that it tunes through."""
