@@ -25,7 +25,7 @@ sub { font-size: .75em; line-height: 0; } li { margin: .25rem 0; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: .86rem; margin: .6rem 0; }
 th { text-align: left; background: #eef2f6; vertical-align: bottom; } th, td { padding: .2rem .6rem; }
 td { border-top: 1px solid #eee; font-variant-numeric: tabular-nums; } tr.first td { border-top: 1px solid #9ab; }
-td { white-space: nowrap; } td.number { text-align: right; } .near { color: #1e7a4f; } .off { color: #b36b00; } 
+td { white-space: nowrap; } td.number { text-align: right; } .near { color: #1e7a4f; } .off { color: #b36b00; }
 .far { color: #b3261e; font-weight: 600; }
 """
 
