@@ -37,7 +37,7 @@ def test_single_gains_override(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_example_of_a_plant_of_one_s_own_runs(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = Path(__file__).parents[1] / "docs" / "your-own-plant.md"
+    page = Path(__file__).parents[2] / "docs" / "your-own-plant.md"
     code, parameters = re.findall(r"```(?:python|yaml)\n(.*?)```", page.read_text(), re.DOTALL)
     (tmp_path / "my_plants").mkdir()
     (tmp_path / "my_plants" / "pendulum.py").write_text(code)
