@@ -9,7 +9,7 @@ lanes side by side so that the compiler can vectorise over them. Both give the s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros.compiled import compiled, entry_point
-from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.controller import Controller, rest_setpoint
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
-from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of
+from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of, settled
 from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.states import loaded, store
 from tdof_npid_ros.scenario import SampledPlan
@@ -36,8 +36,6 @@ LARGEST_OUTPUT = (
 
 # A lane's rows: its coefficients, then these, then the plant's state.
 (_U_I, _Z, _ERROR_SUM, _FINITE, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
-
-PlantAt = Callable[[dict[str, float]], Plant]  # the plant for a set of changed parameters
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,14 @@ def simulate_operated(
     """As `simulate`, with options around the law: stepped one by one, by the same classes as in the nodes."""
     period_ns, lanes = signals.sample_period_ns, gains.lanes
     controller = Controller(gains, period_ns, options)
-    simulator = PlantSimulator(plant_at({}), period_ns, lanes, effort_limits)
+    simulator = PlantSimulator(
+        plant_at_start(plant_at, signals.start, signals.segments[0].plant, effort_limits),
+        period_ns,
+        lanes,
+        effort_limits,
+    )
+    if (rest := rest_setpoint(signals.start, simulator.output, simulator.applied_effort)) is not None:
+        controller.begin_at_rest(simulator.applied_effort, rest)
     plants = {segment.first: plant_at(segment.plant) for segment in signals.segments}
     output, effort = np.empty((2, signals.steps + 1, lanes))
     for k in range(signals.steps + 1):
@@ -129,7 +134,7 @@ def _run(
         gain_limits = limits_of(gains, block.start)
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
-        lane_rows = _run_block_of(plant_at, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
+        lane_rows = _run_block_of(plant_at, gains, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
         iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
         if len(output):
             output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
@@ -155,6 +160,7 @@ def _padded(c: np.ndarray, width: int) -> np.ndarray:
 
 def _run_block_of(
     plant_at: PlantAt,
+    gains: Gains,
     c: np.ndarray,
     gain_limits: Limits,
     signals: SampledPlan,
@@ -164,15 +170,20 @@ def _run_block_of(
 ) -> np.ndarray:
     """Run `width` lanes through every segment of the plan; returns the lanes' rows, (_X + states, width)."""
     width = c.shape[1]
-    initial = plant_at({}).initial_state
+    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, limits)
+    initial = plant.initial_state
     rows = _aligned_zeros(_X + len(initial), width)
     rows[:COEFFICIENTS] = c
     rows[_X:] = np.reshape(initial, (-1, 1))
+    y_0, u_0 = np.full(width, plant.initial_output), np.full(width, plant.initial_effort)
+    if (rest := rest_setpoint(signals.start, y_0, u_0)) is not None:
+        rows[_U_I : _Z + 1] = settled(c, gains, rest, y_0, u_0)
     ring: np.ndarray | None = None
     for segment in signals.segments:
         sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
             ring = _aligned_zeros(sampled.delay + 2, width)
+            ring += plant.initial_effort
         check_same_delay(sampled, len(ring))
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
         arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,

@@ -11,6 +11,9 @@ A plan is written as lines, each `TIME SIGNAL WHAT`, and ends with `TIME end` (t
 
 A value holds until its signal's next line. Setpoint and disturbance start at 0; a plant's parameter that changes
 needs a line at 0 too, so that a plan says by itself what it does.
+
+With `0 start 60` the episode begins at rest: plant and controller are settled at output and setpoint 60, and the
+setpoint starts there.
 """
 
 from __future__ import annotations
@@ -29,10 +32,11 @@ import numpy as np
 from tdof_npid_ros.control.gains import LARGEST_SIGNAL
 
 SIGNALS = ("setpoint", "disturbance")
+START = "start"  # the column of a plan that begins at rest; its value is the same at each point
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
 GRAMMAR = (
     "TIME setpoint|disturbance|plant.NAME VALUE, TIME SIGNAL ramp VALUE over SECONDS, "
-    "TIME SIGNAL sine AMPLITUDE period SECONDS for SECONDS, or TIME end"
+    "TIME SIGNAL sine AMPLITUDE period SECONDS for SECONDS, 0 start VALUE, or TIME end"
 )
 
 
@@ -65,6 +69,7 @@ class SampledPlan:
     setpoint: np.ndarray
     disturbance: np.ndarray
     segments: tuple[Segment, ...]
+    start: float | None = None  # the output at which everything is settled at time 0; None: the plant's own start
 
     @property
     def steps(self) -> int:
@@ -89,7 +94,7 @@ class Plan:
     """Points in time, each holding until the next; the last one's time ends the episode.
 
     Args:
-        names: `setpoint`, `disturbance`, `plant.<parameter>`, one per column.
+        names: `setpoint`, `disturbance`, `start`, `plant.<parameter>`, one per column.
         times_ns: strictly increasing, the first 0.
         values: (points, names), as nested tuples.
 
@@ -103,7 +108,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in self.names:
-            if name not in SIGNALS and not (name.startswith("plant.") and len(name) > len("plant.")):
+            if name not in (*SIGNALS, START) and not (name.startswith("plant.") and len(name) > len("plant.")):
                 raise PlanError(f"unknown signal {name!r}: a plan drives setpoint, disturbance and plant.<parameter>")
         if len(set(self.names)) != len(self.names):
             raise PlanError(f"a signal is named twice in {', '.join(self.names)}")
@@ -120,6 +125,13 @@ class Plan:
                 raise PlanError(f"point {i} at {time / 1e9:g} s holds a value that is not finite: {list(row)}")
             if any(abs(value) > LARGEST_SIGNAL for value in row):
                 raise PlanError(f"point {i} at {time / 1e9:g} s holds a value beyond {LARGEST_SIGNAL:g}: {list(row)}")
+        if START in self.names and len({row[self.names.index(START)] for row in self.values}) > 1:
+            raise PlanError(f"{START} changes within the plan: an episode begins at rest once, at 0 s")
+
+    @property
+    def start(self) -> float | None:
+        """The output at which plant and controller are settled at time 0; None: not said."""
+        return self.values[0][self.names.index(START)] if START in self.names else None
 
     @property
     def end_ns(self) -> int:
@@ -168,6 +180,7 @@ class Plan:
             column.get("setpoint", zero),
             column.get("disturbance", zero),
             self._segments(column, steps),
+            self.start,
         )
 
     def _segments(self, column: Mapping[str, np.ndarray], steps: int) -> tuple[Segment, ...]:
@@ -200,6 +213,8 @@ def parse_plan(lines: Sequence[str], sample_period_ns: int, plant_parameters: Co
     if not entries or entries[-1].signal != "end":
         raise PlanError("a plan ends with the line 'TIME end'")
     names = list(dict.fromkeys(entry.signal for entry in entries[:-1])) or ["setpoint"]
+    if START in names and "setpoint" not in names:
+        names.append("setpoint")
     return _unroll(entries, names, sample_period_ns)
 
 
@@ -231,13 +246,15 @@ def _parse_line(index: int, text: str, known: Collection[str] | None) -> _Entry:
         return _Entry(where, round(time * 1e9), "end", "step", ())
     if known is not None and signal.startswith("plant.") and signal.removeprefix("plant.") not in known:
         raise PlanError(f"{where}: unknown plant parameter; those that may change are {', '.join(known) or 'none'}")
-    if signal not in SIGNALS and not signal.startswith("plant."):
+    if signal not in (*SIGNALS, START) and not signal.startswith("plant."):
         raise PlanError(f"{where}: unknown signal {signal!r}; expected {GRAMMAR}")
     shape, words = (words[2] if len(words) > 2 else ""), words[2:]
     if shape not in _SHAPES:
         if len(words) != 1:
             raise PlanError(f"{where}: expected {GRAMMAR}")
         return _Entry(where, round(time * 1e9), signal, "step", (_finite(words[0], where),))
+    if signal == START:
+        raise PlanError(f"{where}: an episode begins at rest at one value, as 0 start 60")
     pattern = _SHAPES[shape]
     if len(words) != len(pattern) or any(want not in (0, word) for want, word in zip(pattern, words, strict=True)):
         raise PlanError(f"{where}: expected {GRAMMAR}")
@@ -261,7 +278,8 @@ def _unroll(entries: list[_Entry], names: list[str], period_ns: int) -> Plan:
     end_ns = entries[-1].time_ns
     if not 1 <= end_ns // period_ns <= LARGEST_PLAN:
         raise PlanError(f"{entries[-1].where}: an episode has 1 to {LARGEST_PLAN} samples of {period_ns / 1e9:g} s")
-    tracks: dict[str, dict[int, float]] = {name: {0: 0.0} if name in SIGNALS else {} for name in names}
+    starts = {"setpoint": _start(entries), "disturbance": 0.0}
+    tracks: dict[str, dict[int, float]] = {name: {0: starts[name]} if name in starts else {} for name in names}
     for i, entry in enumerate(entries[:-1]):
         if not tracks[entry.signal] and (entry.time_ns, entry.shape) != (0, "step"):
             raise PlanError(f"{entry.where}: give {entry.signal} a value at 0 s first")
@@ -272,6 +290,15 @@ def _unroll(entries: list[_Entry], names: list[str], period_ns: int) -> Plan:
     times = sorted({0, end_ns, *(t for track in tracks.values() for t in track if t < end_ns)})
     columns = [_held(tracks[name], times) for name in names]
     return Plan(tuple(names), tuple(times), tuple(zip(*columns, strict=True)))
+
+
+def _start(entries: Sequence[_Entry]) -> float:
+    """Where the setpoint starts."""
+    lines = [entry for entry in entries if entry.signal == START]
+    for entry in lines:
+        if entry.time_ns or entry is not lines[0]:
+            raise PlanError(f"{entry.where}: an episode begins at rest once, at 0 s")
+    return lines[0].numbers[0] if lines else 0.0
 
 
 def _points(entry: _Entry, start: float, stop_ns: int, period_ns: int) -> dict[int, float]:

@@ -22,6 +22,7 @@ from tdof_npid_ros.control.law import (
     any_at_limit,
     coefficients,
     limits_of,
+    settled,
 )
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions
 from tdof_npid_ros.control.shaping import EFFORT, OUTPUT, SETPOINT, STATES, shape_lanes, shape_of
@@ -47,6 +48,7 @@ class Controller:
         self.stamp_ns: int | None = None
         self._applied: np.ndarray | None = None
         self._integral: np.ndarray | None = None
+        self._rest: np.ndarray | None = None
         options.check_lanes(gains)
         self._law = _Law(gains, options, sample_period_ns)
         self._allocate()
@@ -99,7 +101,7 @@ class Controller:
         """Forget the state and the latest answer."""
         self._state[:] = 0.0
         self.stamp_ns = None
-        self._applied = self._integral = None
+        self._applied = self._integral = self._rest = None
         self._settled = False
 
     def warm_up(self) -> None:
@@ -118,8 +120,17 @@ class Controller:
             integral: the integral action to begin with, (lanes,); None: the one with which the answer is `applied`.
         """
         self.stamp_ns = None
-        self._applied, self._integral = applied, integral
+        self._applied, self._integral, self._rest = applied, integral, None
         self._settled = False
+
+    def begin_at_rest(self, applied: np.ndarray, setpoint: np.ndarray) -> None:
+        """Let the next answer begin settled: at this setpoint, with the effort that the plant rests with.
+
+        Args:
+            applied, setpoint: (lanes,).
+        """
+        self.begin_within(applied)
+        self._rest = setpoint
 
     def answer(self, stamp_ns: int, setpoint: np.ndarray, output: np.ndarray) -> bool:
         """Answer the output of `stamp_ns`; the answer is in `effort` and `terms`.
@@ -143,7 +154,7 @@ class Controller:
 
     def _allocate(self) -> None:
         lanes = self._law.gains.lanes
-        self.stamp_ns = self._applied = self._integral = None
+        self.stamp_ns = self._applied = self._integral = self._rest = None
         self._state = np.zeros((2, lanes))
         self._shaping = np.zeros((STATES, lanes))
         self._latest = np.zeros(lanes), np.zeros(lanes)
@@ -163,16 +174,19 @@ class Controller:
 
     def _begin(self, setpoint: np.ndarray, output: np.ndarray) -> None:
         law, applied = self._law, self._applied
-        self._shaping[SETPOINT] = output if law.shape.setpoint_step < np.inf else setpoint
+        if self._rest is not None:
+            setpoint = self._rest
+        ramps = law.shape.setpoint_step < np.inf and self._rest is None
+        self._shaping[SETPOINT] = output if ramps else setpoint
         self._shaping[OUTPUT] = output
         self._shaping[EFFORT] = 0.0 if applied is None else applied
         if applied is None:
             return
         r, y = law.shaped(setpoint, output, self._shaping)
-        self._state[FILTER] = law.derivative_error(r, y)
-        wanted = applied - law.proportional(r, y) if self._integral is None else self._integral
-        self._state[INTEGRAL] = law.integral(wanted, 0.0)
-        self._applied = self._integral = None
+        self._state[:] = settled(law.c, law.gains, r, y, applied)
+        if self._integral is not None:
+            self._state[INTEGRAL] = law.integral(self._integral, 0.0)
+        self._applied = self._integral = self._rest = None
 
     def _take_over(self, before: _Law, setpoint: np.ndarray, output: np.ndarray) -> None:
         """Give the state of the law before to the one now, so that the effort does not jump."""
@@ -207,6 +221,19 @@ class Controller:
         with np.errstate(over="ignore"):
             fraction = np.divide(kd, kd_before, out=np.zeros(len(kd)), where=kd_before != 0)
         return np.asarray(np.clip(fraction, 0.0, 1.0))
+
+
+def rest_setpoint(start: float | None, output: np.ndarray, effort: np.ndarray) -> np.ndarray | None:
+    """The setpoint at which a controller begins settled with a plant that begins at rest; None: it begins from nothing.
+
+    Args:
+        start: where the plan says that everything is settled; None: it does not.
+        output, effort: of the plant at its start, (lanes,). Without `start`, an effort other than 0 is an operating
+            point, and the setpoint counts as the output there.
+    """
+    if start is not None:
+        return np.full(len(output), start)
+    return output.copy() if effort.any() else None
 
 
 class _Law:

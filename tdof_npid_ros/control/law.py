@@ -145,6 +145,20 @@ def limits_of(gains: Gains, lane: int = 0) -> Limits:
     return low, high, gains.integral_min, gains.integral_max, float(gains.anti_windup == "conditional")
 
 
+def settled(c: np.ndarray, gains: Gains, r: np.ndarray, y: np.ndarray, applied: np.ndarray) -> np.ndarray:
+    """The law's state, (2, lanes): integral action and derivative filter, that rests at r and y with effort `applied`.
+
+    Lanes without integral gain have no integral action: they could never leave it again.
+
+    Args:
+        c: coefficients, (COEFFICIENTS, lanes).
+        r, y, applied: setpoint, output and effort at rest, (lanes,).
+    """
+    wanted = applied - c[KP] * ((1.0 - c[ALPHA]) * r - y)
+    integral = np.where(c[KI_H] != 0, np.clip(wanted, gains.integral_min, gains.integral_max), 0.0)
+    return np.stack([integral, (1.0 - c[BETA]) * r - y])
+
+
 def tracking_time(gains: Gains) -> np.ndarray:
     """Back-calculation's tracking time in s, (lanes,): as given, or sqrt(kd/ki), or kp/ki without derivative action.
 

@@ -10,15 +10,25 @@ from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.ode import Ode, Sprott, load_class
 from tdof_npid_ros.plants.plant import Plant, PlantError
 
+OFFSETS = {"output_offset": 0.0, "effort_offset": 0.0}  # a linear model's operating point
+
 # Parameters of each model and their defaults; the equation is the paper's.
 MODELS: dict[str, dict[str, float | list[float]]] = {
-    "first_order": {"gain": 1.0, "time_constant": 5.0, "dead_time": 0.5},  # (11)
-    "second_order": {"gain": 1.0, "time_constant": 2.0, "dead_time": 1.0},  # (12), both time constants
-    "third_order": {"gain": 1.0, "time_constant": 1.0, "zero_time_constant": 1.0, "dead_time": 0.0},  # (13)
-    "transfer_function": {"numerator": [1.0], "denominator": [1.0, 1.0], "dead_time": 0.0},
+    "first_order": {"gain": 1.0, "time_constant": 5.0, "dead_time": 0.5, **OFFSETS},  # (11)
+    "second_order": {"gain": 1.0, "time_constant": 2.0, "dead_time": 1.0, **OFFSETS},  # (12), both time constants
+    "third_order": {"gain": 1.0, "time_constant": 1.0, "zero_time_constant": 1.0, "dead_time": 0.0, **OFFSETS},  # (13)
+    "transfer_function": {"numerator": [1.0], "denominator": [1.0, 1.0], "dead_time": 0.0, **OFFSETS},
     "sprott": {"a": 0.6, "b": 1.2, "c": 2.0, "initial_state": [0.0, 0.0, 0.0]},  # (14)-(16)
 }
-FIXED_WHILE_RUNNING = ("dead_time", "initial_state", "substeps", "numerator", "denominator")
+FIXED_WHILE_RUNNING = (
+    "dead_time",
+    "output_offset",
+    "effort_offset",
+    "initial_state",
+    "substeps",
+    "numerator",
+    "denominator",
+)
 
 
 def model_parameters(model: str) -> dict[str, float | list[float]]:
@@ -51,15 +61,16 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
         return Ode(load_class(model), p, tuple(initial_state), substeps)
     if model == "sprott":
         return Sprott(p["a"], p["b"], p["c"], tuple(p["initial_state"]))
+    offsets = {name: p[name] for name in OFFSETS}
     if model == "transfer_function":
-        return TransferFunction(tuple(p["numerator"]), tuple(p["denominator"]), p["dead_time"])
+        return TransferFunction(tuple(p["numerator"]), tuple(p["denominator"]), p["dead_time"], **offsets)
     t = _positive("time_constant", p["time_constant"])
     if model == "first_order":
-        return TransferFunction((p["gain"],), (t, 1.0), p["dead_time"])
+        return TransferFunction((p["gain"],), (t, 1.0), p["dead_time"], **offsets)
     if model == "second_order":
-        return TransferFunction((p["gain"],), (t * t, 2.0 * t, 1.0), p["dead_time"])
+        return TransferFunction((p["gain"],), (t * t, 2.0 * t, 1.0), p["dead_time"], **offsets)
     k, c = p["gain"], p["zero_time_constant"]
-    return TransferFunction((-k * c, k), (t * t * t, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"])
+    return TransferFunction((-k * c, k), (t * t * t, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"], **offsets)
 
 
 def _typed(name: str, value: Any, default: float | list[float]) -> Any:

@@ -26,6 +26,16 @@ class SampledLinear(NamedTuple):
     delay: int
 
 
+class SampledOffset(NamedTuple):
+    """A linear plant about an operating point that is not 0: `SampledLinear` plus a constant term in each step."""
+
+    phi: tuple[tuple[float, ...], ...]
+    gamma_old: tuple[float, ...]
+    gamma_new: tuple[float, ...]
+    delay: int
+    constant: tuple[float, ...]
+
+
 class SampledSprott(NamedTuple):
     """The Sprott circuit (16), one fourth-order Runge-Kutta step a sample."""
 
@@ -101,7 +111,7 @@ def _plant_output(plant: Any, x: Any) -> Any:
 
 @implementation_of(plant_input)
 def _plant_input(plant: Any, u: Any, d: Any) -> Any:
-    if _is(plant, SampledLinear):
+    if _is(plant, SampledLinear) or _is(plant, SampledOffset):
         return lambda plant, u, d: u + d
     return lambda plant, u, d: u
 
@@ -118,6 +128,10 @@ def _plant_advance(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
     if _is(plant, SampledLinear):
         return lambda plant, x, v_old, v_new, d: linear_map(
             plant.phi, x, plant.gamma_old, v_old, plant.gamma_new, v_new
+        )
+    if _is(plant, SampledOffset):
+        return lambda plant, x, v_old, v_new, d: along(
+            linear_map(plant.phi, x, plant.gamma_old, v_old, plant.gamma_new, v_new), plant.constant, 1.0
         )
     if _is(plant, SampledSprott):
         return lambda plant, x, v_old, v_new, d: runge_kutta(plant, x, v_new, d, plant.step)

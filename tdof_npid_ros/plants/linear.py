@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import mpmath
 
-from tdof_npid_ros.plants.kernels import SampledLinear
+from tdof_npid_ros.plants.kernels import SampledLinear, SampledOffset
 from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
@@ -23,7 +23,9 @@ _PRECISION = threading.Lock()  # mpmath's precision belongs to the whole process
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """G(s) = numerator(s)/denominator(s) · exp(-dead_time s); the disturbance adds to the effort.
+    """y - output_offset = G(s) (u - effort_offset + d), G(s) = numerator(s)/denominator(s) · exp(-dead_time s).
+
+    The offsets are the operating point that the model is about: there the plant is at rest, and there it begins.
 
     The state is the observable canonical form's: x[0] is the output, so a parameter that changes while the loop runs
     does not make the output jump.
@@ -31,6 +33,8 @@ class TransferFunction:
     Args:
         numerator, denominator: coefficients, highest power of s first; the numerator's degree is the lower one.
         dead_time: s, any number that is not negative; it need not be a multiple of the sample period.
+        output_offset, effort_offset: the operating point, in the units of y and u.
+        start: the output with which it begins, at rest; None: the operating point's.
 
     Raises:
         PlantError: not a strictly proper transfer function, or a dead time that is negative.
@@ -39,6 +43,9 @@ class TransferFunction:
     numerator: tuple[float, ...]
     denominator: tuple[float, ...]
     dead_time: float = 0.0
+    output_offset: float = 0.0
+    effort_offset: float = 0.0
+    start: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "numerator", _trimmed("numerator", self.numerator))
@@ -48,17 +55,52 @@ class TransferFunction:
                 f"numerator of degree {len(self.numerator) - 1} over denominator of degree "
                 f"{len(self.denominator) - 1}: the numerator's degree must be the lower one (strictly proper)"
             )
+        for name in ("output_offset", "effort_offset"):
+            if not math.isfinite(getattr(self, name)):
+                raise PlantError(f"{name} is {getattr(self, name)}: it must be finite")
         if not 0 <= self.dead_time <= LONGEST_DEAD_TIME:
             raise PlantError(f"dead_time is {self.dead_time} s: it must be from 0 to {LONGEST_DEAD_TIME:g}")
 
     @property
     def initial_state(self) -> tuple[float, ...]:
-        """At rest: one zero per state."""
-        return (0.0,) * (len(self.denominator) - 1)
+        """At rest: the output, and what holds it there; zeros at an operating point of zeros."""
+        leading = self.denominator[0]
+        deviation, input_ = self.initial_output - self.output_offset, self.initial_effort - self.effort_offset
+        order = len(self.denominator) - 1
+        b = (0.0,) * (order - len(self.numerator)) + self.numerator
+        held = (
+            0.0 + (self.denominator[i + 1] * deviation - b[i] * input_) / leading for i in range(order - 1)
+        )  # no -0.0
+        return (self.initial_output, *held)
 
-    def sampled(self, sample_period_ns: int) -> SampledLinear:
+    @property
+    def initial_output(self) -> float:
+        """y at time 0."""
+        return self.output_offset if self.start is None else self.start
+
+    @property
+    def initial_effort(self) -> float:
+        """u before time 0: what holds the output where it begins."""
+        gain, integrates = self.numerator[-1], self.denominator[-1] == 0.0
+        if self.start is None or integrates:
+            return self.effort_offset
+        return self.effort_offset + (self.start - self.output_offset) * self.denominator[-1] / gain
+
+    def at_rest(self, output: float) -> TransferFunction:
+        """The same plant, beginning at rest with this output."""
+        if self.numerator[-1] == 0.0 and output != self.output_offset:
+            raise PlantError(
+                f"no effort holds the output at {output:g}: the numerator is 0 at s = 0, so the plant rests at "
+                f"{self.output_offset:g} alone"
+            )
+        return replace(self, start=output)
+
+    def sampled(self, sample_period_ns: int) -> SampledLinear | SampledOffset:
         """The plant as the closed loop steps it, every `sample_period_ns`."""
-        return _sample(self.numerator, self.denominator, nanoseconds(self.dead_time), sample_period_ns)
+        transfer = (self.numerator, self.denominator, nanoseconds(self.dead_time), sample_period_ns)
+        if self.output_offset == 0.0 and self.effort_offset == 0.0:
+            return _sample(*transfer)
+        return _sample_offset(*transfer, self.output_offset, self.effort_offset)
 
 
 def _trimmed(name: str, coefficients: Sequence[float]) -> tuple[float, ...]:
@@ -100,6 +142,28 @@ def _sample(
             gamma_new=tuple(float(gamma_new[i]) for i in range(order)),
             delay=delay,
         )
+
+
+@lru_cache(maxsize=64)
+def _sample_offset(
+    numerator: tuple[float, ...],
+    denominator: tuple[float, ...],
+    dead_time_ns: int,
+    period_ns: int,
+    output_offset: float,
+    effort_offset: float,
+) -> SampledOffset:
+    """As `_sample`, and a constant: x⁺ - c = phi (x - c) + gamma (v - v0), c = (y0, 0, …)."""
+    linear = _sample(numerator, denominator, dead_time_ns, period_ns)
+    with _PRECISION, mpmath.workdps(DIGITS):
+        constant = tuple(
+            float(
+                mpmath.mpf(output_offset) * ((i == 0) - mpmath.mpf(linear.phi[i][0]))
+                - mpmath.mpf(effort_offset) * (mpmath.mpf(linear.gamma_old[i]) + mpmath.mpf(linear.gamma_new[i]))
+            )
+            for i in range(len(linear.phi))
+        )
+    return SampledOffset(*linear, constant=constant)
 
 
 def _observable_form(

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.scenario import Plan, episode_named
-
-PlantAt = Callable[[dict[str, float]], Plant]
 
 
 class Episode:
@@ -24,6 +20,8 @@ class Episode:
 
     def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, number: int) -> None:
         signals = plan.sampled(simulator.sample_period_ns)
+        if plan.start is not None:
+            simulator.reset(plant_at_start(plant_at, plan.start, signals.segments[0].plant, simulator.effort_limits))
         self.name = f"{plan.digest}/{number}"
         self.steps = signals.steps
         self.stamp_ns = 0

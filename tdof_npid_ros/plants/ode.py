@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numba
+import numpy as np
 
 from tdof_npid_ros.plants.kernels import SampledOde, SampledSprott
 from tdof_npid_ros.plants.plant import PlantError
+
+RESTING = 1e-9  # largest |dx/dt|, relative to the state's size, at which a plant counts as at rest
 
 
 @dataclass(frozen=True)
@@ -28,12 +32,25 @@ class Sprott:
     b: float = 1.2
     c: float = 2.0
     initial_state: tuple[float, ...] = (0.0, 0.0, 0.0)
+    initial_effort: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("a", "b", "c"):
             if not math.isfinite(getattr(self, name)):
                 raise PlantError(f"{name} is {getattr(self, name)}: it must be finite")
         object.__setattr__(self, "initial_state", _state(self.initial_state, 3))
+
+    @property
+    def initial_output(self) -> float:
+        """y at time 0."""
+        return self.initial_state[0]
+
+    def at_rest(self, output: float) -> Sprott:
+        """The same circuit, beginning at rest with this output: x2 = 0, x3 = -u = (c sgn(y) - b y)/a."""
+        if self.a == 0.0:
+            raise PlantError(f"no effort holds the output at {output:g}: a is 0")
+        third = (math.copysign(self.c, output) * (output != 0.0) - self.b * output) / self.a
+        return replace(self, initial_state=(output, 0.0, third), initial_effort=-third)
 
     def sampled(self, sample_period_ns: int) -> SampledSprott:
         """The plant as the closed loop steps it."""
@@ -64,7 +81,20 @@ class Ode:
         self.substeps = int(substeps)
         self._derivative = _compiled(description.derivative)  # type: ignore[attr-defined]
         self._output = _compiled(description.output)  # type: ignore[attr-defined]
+        self.initial_effort = 0.0
         self._try_out()
+
+    @property
+    def initial_output(self) -> float:
+        """y at time 0."""
+        return float(self._output(self.initial_state, self.values))
+
+    def at_rest(self, output: float) -> Ode:
+        """The same plant, beginning where dx/dt = 0 with this output; found numerically from `initial_state`."""
+        state, effort = _resting(self._derivative, self._output, self.values, self.initial_state, output)
+        resting = copy.copy(self)
+        resting.initial_state, resting.initial_effort = state, effort
+        return resting
 
     def sampled(self, sample_period_ns: int) -> SampledOde:
         """The plant as the closed loop steps it."""
@@ -90,6 +120,34 @@ class Ode:
             raise PlantError(f"{name}: derivative and output must return floats, not {slope!r} and {y!r}")
         if not all(map(math.isfinite, (*slope, y))):
             raise PlantError(f"{name}: in its initial state dx/dt is {slope!r} and y is {y!r}: they must be finite")
+
+
+def _resting(
+    derivative: Any, output: Any, values: tuple[float, ...], guess: tuple[float, ...], wanted: float
+) -> tuple[tuple[float, ...], float]:
+    """State and effort with dx/dt = 0 and output `wanted`; to 12 digits, so that they are the same on every machine.
+
+    Raises:
+        PlantError: there are none near the guess.
+    """
+    from scipy.optimize import root
+
+    def unbalanced(unknown: np.ndarray) -> list[float]:
+        x = tuple(map(float, unknown[:-1]))
+        return [*derivative(x, float(unknown[-1]), 0.0, values), output(x, values) - wanted]
+
+    best = math.inf
+    for effort in (0.0, 1.0, wanted, -1.0):
+        for method in ("hybr", "lm"):
+            found = root(unbalanced, [*guess, effort], method=method, tol=1e-13)
+            rounded = [float(f"{value:.12g}") for value in found.x]
+            residual = np.abs(unbalanced(np.array(rounded)))
+            best = min(best, float(np.nan_to_num(residual.max(), nan=math.inf)))
+            if best <= RESTING * (1.0 + np.abs(rounded).max()):
+                return tuple(rounded[:-1]), rounded[-1]
+    raise PlantError(
+        f"no state at rest was found with the output at {wanted:g} (nearest: dx/dt or y off by {best:.3g})"
+    )
 
 
 def load_class(path: str) -> Any:

@@ -46,9 +46,9 @@ class PlantSimulator:
         self._ring = None
         self.change_plant(plant)
         self._x = np.repeat(np.array(plant.initial_state), self.lanes)
-        self._ring = np.zeros((self._sampled.delay + 2) * self.lanes)
+        self._ring = np.full((self._sampled.delay + 2) * self.lanes, plant.initial_effort)
         self._step = 0
-        self.applied_effort = np.zeros(self.lanes)
+        self.applied_effort = np.full(self.lanes, plant.initial_effort)
         self.output = np.zeros(self.lanes)
         kernel_for(self._sampled, output_lanes)(self._sampled, self._like, self._x, self.output)
 

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "analysis"))
 from loop_bags import LoopBag
 
 from tdof_npid_ros.case import load_case
-from tdof_npid_ros.graph.__main__ import NODES
+from tdof_npid_ros.graph.__main__ import MODULES as NODES
 from tdof_npid_ros.graph.recorder.node import EXPECTED as EXPECTED_BY_RECORDER
 
 OWN_PARAMETERS = {"/parameter_events"}  # every node may listen to its own clock parameter; not all versions of rclpy do

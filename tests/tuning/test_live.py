@@ -168,7 +168,7 @@ def test_a_trial_integrates_its_step_until_it_has_settled() -> None:
     assert trial.outcome == "measured"
     assert trial.setpoint == 2.0
     assert trial.iae == pytest.approx(0.5, rel=0.05)  # of a step of 1, but for what is left in the band
-    assert trial.share == 1.0
+    assert trial.fraction == 1.0
 
 
 def test_a_slow_candidate_pays_for_the_whole_time_limit() -> None:
@@ -183,7 +183,7 @@ def test_a_trial_ends_when_output_or_effort_leaves_its_range(output: float, effo
     trial.take(0.0, 0.0, 0.0)
     trial.take(0.01, output, effort)
     assert trial.outcome == "unsafe"
-    assert trial.share == 0.0
+    assert trial.fraction == 0.0
 
 
 def test_a_trial_that_failed_later_has_come_further() -> None:
@@ -193,7 +193,7 @@ def test_a_trial_that_failed_later_has_come_further() -> None:
         for k in range(round(until / 0.01)):
             trial.take(k * 0.01, 0.0, 0.0)
         trial.take(until, 9.0, 0.0)
-        shares_.append(trial.share)
+        shares_.append(trial.fraction)
     assert 0.0 < shares_[0] < shares_[1] < 1.0
 
 
@@ -201,7 +201,7 @@ def test_a_candidate_that_never_settles_before_its_step_has_failed() -> None:
     trial = Trial(TEST, 0.0, 2.0)
     for k in range(1002):
         trial.take(k * 0.01, math.sin(k * 0.01), 0.0)
-    assert (trial.outcome, trial.share, trial.setpoint) == ("unsettled", 0.0, 0.0)
+    assert (trial.outcome, trial.fraction, trial.setpoint) == ("unsettled", 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
