@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from tdof_npid_ros.input_file import InputError, read_yaml
+
 
 class ParameterFileError(ValueError):
     """A parameter file that cannot be read or written; the message names the file and what is wrong with it."""
@@ -60,11 +62,9 @@ def _text(nodes: dict[str, dict[str, Any]]) -> str:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ParameterFileError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterFileError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+        document = read_yaml(path)
+    except InputError as error:
+        raise ParameterFileError(str(error)) from error
     if not isinstance(document, dict):
         raise ParameterFileError(f"{path} is not a ROS parameter file: it needs node names at the top")
     return document

@@ -11,12 +11,13 @@ from typing import Any, Final
 import yaml
 
 from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.input_file import InputError, read_file
+from tdof_npid_ros.yaml_text import YamlTextError, load_yaml
 
 FILE_NAME: Final = "metadata.yaml"
 VERSION: Final = 9
 
 _NO_START: Final = 2**63 - 1  # what rosbag2 writes for a bag without messages
-_MAX_BYTES: Final = 4 << 20
 _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -49,6 +50,15 @@ def qos_text(profiles: Sequence[QosProfile]) -> str:
     if not profiles:
         return ""
     return yaml.safe_dump([profile.as_dict() for profile in profiles], sort_keys=False).strip()
+
+
+def _profiles(qos: str) -> list[Any]:
+    """Return the QoS profiles of a channel's text, none when it holds none that can be read."""
+    try:
+        profiles = load_yaml(qos)
+    except YamlTextError:
+        return []
+    return profiles if isinstance(profiles, list) else []
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,7 @@ class BagMetadata:
                         "name": topic.name,
                         "type": topic.type,
                         "serialization_format": "cdr",
-                        "offered_qos_profiles": yaml.safe_load(topic.qos) or [],
+                        "offered_qos_profiles": _profiles(topic.qos),
                         "type_description_hash": topic.type_hash,
                     },
                     "message_count": topic.count,
@@ -148,16 +158,26 @@ def read_information(folder: Path) -> dict[str, Any]:
     """
     path = folder / FILE_NAME
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise BagError(f"{path}: larger than {_MAX_BYTES >> 20} MiB, no metadata of a bag: delete it")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        information = content["rosbag2_bagfile_information"] if content else {}
+        path.lstat()
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise BagError(f"{path}: cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError):
-        raise BagError(f"{path}: no valid rosbag2 metadata: delete it, the bag opens without") from None
+    try:
+        text = read_file(path).decode("utf-8")
+    except InputError as error:
+        raise BagError(str(error)) from None
+    except UnicodeDecodeError:
+        raise _no_metadata(path) from None
+    try:
+        content = load_yaml(text)
+        information = content["rosbag2_bagfile_information"] if content else {}
+    except (YamlTextError, TypeError, KeyError):
+        raise _no_metadata(path) from None
     if not isinstance(information, dict):
-        raise BagError(f"{path}: no valid rosbag2 metadata: delete it, the bag opens without")
+        raise _no_metadata(path)
     return information
+
+
+def _no_metadata(path: Path) -> BagError:
+    return BagError(f"{path}: no valid rosbag2 metadata: delete it, the bag opens without")
