@@ -230,7 +230,7 @@ def _names(array: Any, parents: Sequence[Any]) -> tuple[str, ...]:
     """The names of an array's elements: their own, or those in a message around it, the nearest first."""
     if len(array) and _fields(array[0]):
         own = [_get(element, "name") if _has(element, "name") else None for element in array]
-        return tuple(own) if all(isinstance(name, str) for name in own) else ()
+        return tuple(map(str, own)) if all(isinstance(name, str) for name in own) else ()
     for parent in reversed(parents):
         for field in NAMES_OF_ELEMENTS:
             names = _get(parent, field) if _has(parent, field) else ()
