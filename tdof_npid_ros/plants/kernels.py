@@ -119,7 +119,7 @@ def _plant_input(plant: Any, u: Any, d: Any) -> Any:
 @implementation_of(plant_derivative)
 def _plant_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
     if _is(plant, SampledSprott):
-        return _sprott_derivative
+        return sprott_derivative
     return lambda plant, x, u, d: plant.derivative(x, u, d, plant.parameters)
 
 
@@ -138,7 +138,7 @@ def _plant_advance(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
     return _ode_advance
 
 
-def _sprott_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
+def sprott_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
     """Equation (16); a: damping, b: stiffness, c: size of the switched term."""
     sign = 1.0 if x[0] > 0.0 else (-1.0 if x[0] < 0.0 else 0.0)
     return (x[1], x[2] + u, plant.c * sign - plant.b * x[0] - x[1] - plant.a * x[2] + d)

@@ -14,9 +14,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from tdof_npid_ros.plants.kernels import SampledOde, SampledSprott
+from tdof_npid_ros.plants.kernels import SampledOde, SampledSprott, sprott_derivative
 from tdof_npid_ros.plants.plant import PlantError
 
+State = tuple[float, ...]
 RESTING = 1e-9  # largest |dx/dt|, relative to the state's size, at which a plant counts as at rest
 
 
@@ -44,6 +45,14 @@ class Sprott:
     def initial_output(self) -> float:
         """y at time 0."""
         return self.initial_state[0]
+
+    def derivative(self, x: State, u: float, d: float) -> State:
+        """dx/dt in the state x under effort u and disturbance d."""
+        return tuple(sprott_derivative(self.sampled(1), x, u, d))
+
+    def output(self, x: State) -> float:
+        """y in the state x."""
+        return x[0]
 
     def at_rest(self, output: float) -> Sprott:
         """The same circuit, beginning at rest with this output: x2 = 0, x3 = -u = (c sgn(y) - b y)/a."""
@@ -87,11 +96,19 @@ class Ode:
     @property
     def initial_output(self) -> float:
         """y at time 0."""
-        return float(self._output(self.initial_state, self.values))
+        return self.output(self.initial_state)
+
+    def derivative(self, x: State, u: float, d: float) -> State:
+        """dx/dt in the state x under effort u and disturbance d."""
+        return tuple(self._derivative(x, u, d, self.values))
+
+    def output(self, x: State) -> float:
+        """y in the state x."""
+        return float(self._output(x, self.values))
 
     def at_rest(self, output: float) -> Ode:
         """The same plant, beginning where dx/dt = 0 with this output; found numerically from `initial_state`."""
-        state, effort = _resting(self._derivative, self._output, self.values, self.initial_state, output)
+        state, effort = _resting(self, output)
         resting = copy.copy(self)
         resting.initial_state, resting.initial_effort = state, effort
         return resting
@@ -122,24 +139,22 @@ class Ode:
             raise PlantError(f"{name}: in its initial state dx/dt is {slope!r} and y is {y!r}: they must be finite")
 
 
-def _resting(
-    derivative: Any, output: Any, values: tuple[float, ...], guess: tuple[float, ...], wanted: float
-) -> tuple[tuple[float, ...], float]:
+def _resting(plant: Ode, wanted: float) -> tuple[State, float]:
     """State and effort with dx/dt = 0 and output `wanted`; to 12 digits, so that they are the same on every machine.
 
     Raises:
-        PlantError: there are none near the guess.
+        PlantError: there are none near the plant's initial state.
     """
     from scipy.optimize import root
 
     def unbalanced(unknown: np.ndarray) -> list[float]:
         x = tuple(map(float, unknown[:-1]))
-        return [*derivative(x, float(unknown[-1]), 0.0, values), output(x, values) - wanted]
+        return [*plant.derivative(x, float(unknown[-1]), 0.0), plant.output(x) - wanted]
 
     best = math.inf
     for effort in (0.0, 1.0, wanted, -1.0):
         for method in ("hybr", "lm"):
-            found = root(unbalanced, [*guess, effort], method=method, tol=1e-13)
+            found = root(unbalanced, [*plant.initial_state, effort], method=method, tol=1e-13)
             rounded = [float(f"{value:.12g}") for value in found.x]
             residual = np.abs(unbalanced(np.array(rounded)))
             best = min(best, float(np.nan_to_num(residual.max(), nan=math.inf)))
