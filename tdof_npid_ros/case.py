@@ -95,6 +95,18 @@ class Case:
         """The plan of each episode, sampled."""
         return {name: plan.sampled(self.sample_period_ns) for name, plan in self.plans.items()}
 
+    @cached_property
+    def largest_step(self) -> float:
+        """The largest change of the setpoint at once, over all plans, in the output's unit; 0 without any.
+
+        A setpoint that does not begin at the output with which the plant begins steps there.
+        """
+        steps = [0.0]
+        for signals in self.signals.values():
+            first = self.plant.initial_output if signals.start is None else signals.start
+            steps.append(float(np.abs(np.diff(signals.setpoint, prepend=first)).max()))
+        return max(steps)
+
     def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
         """Run an episode in process; gains for one lane or many, by default the case's.
 

@@ -12,6 +12,8 @@ from typing import NoReturn
 
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {
+    "new": "write a commented parameter file for a plant of your own",
+    "check": "look at a parameter file as an experienced colleague would",
     "demo": "run the paper's first process over ROS 2, end to end",
     "simulate": "run a case in process and print its metrics",
     "tune": "find the gains of a case with the hybrid genetic algorithm",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict
+import warnings
+from dataclasses import asdict, replace
 from typing import Any
 
+from tdof_npid_ros.advice import gravest
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains
 from tdof_npid_ros.control.gains import PER_LANE, Gains
@@ -21,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of the case's setpoint and disturbance episodes."""
     case = load_case(arguments.case)
-    report = response_report(case, chosen_gains(case, arguments))
+    gains = chosen_gains(case, arguments)
+    report = response_report(case, gains) | advised(case, gains)
     print(json.dumps(report) if arguments.json else _table(report))
     return 0
 
@@ -37,6 +40,15 @@ def response_report(case: Case, gains: Gains) -> dict[str, Any]:
         "disturbance": _without_empty_reason(asdict(disturbance)),
         "objective": setpoint.iae + case.weight * disturbance.iae,
     }
+
+
+def advised(case: Case, gains: Gains) -> dict[str, Any]:
+    """Warn of the gravest finding with these gains, if there is one; the same as a key for the JSON object."""
+    found = gravest(replace(case, gains=gains))
+    if found is None:
+        return {}
+    warnings.warn(found.line(), stacklevel=2)
+    return {"warning": found._asdict()}
 
 
 def _without_empty_reason(metrics: dict[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli import INTERRUPTED
-from tdof_npid_ros.cli.simulate import response_report
+from tdof_npid_ros.cli.simulate import advised, response_report
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
@@ -71,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = study.result
     report = response_report(problem.case, result.gains)
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
+    report |= advised(problem.case, result.gains)
     if arguments.out:
         write_parameters(arguments.out, {"controller": result.gains.as_dict()})
     if arguments.plot:
