@@ -6,16 +6,17 @@ message of a layout is walked in Python; all others are compared with it at thei
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdof_npid_ros.bag import scan
-from tdof_npid_ros.bag.cdr import HEAD_BYTES, CdrCursor, Order, read_field
+from tdof_npid_ros.bag.cdr import HEAD_BYTES, CdrCursor, Order, Span, ValueBuilder, walk, walk_field
 from tdof_npid_ros.bag.definition import PRIMITIVES, STRING, TIMES, Definition, Field
-from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.errors import BagError, choices, shown
 
 Column = NDArray[Any]
 Columns = dict[str, Column]
@@ -39,6 +40,7 @@ class Layout(NamedTuple):
     order: Order
     length_words: NDArray[np.int64]  # which 32-bit words of a row are length fields
     lengths: NDArray[np.uint32]
+    texts: list[Span]
     extractors: tuple[tuple[str, _Extract], ...]
 
     def key(self) -> tuple[str, bytes, bytes]:
@@ -53,6 +55,28 @@ class Layout(NamedTuple):
             same &= (words == self.lengths).all(axis=1)
         return same
 
+    def valid(self, rows: _Rows) -> NDArray[np.bool_]:
+        """Tell in which rows of this layout all strings are right; the first row was looked at already."""
+        right = np.ones(len(rows), np.bool_)
+        if len(rows) == 1:
+            return right
+        for start, size in self.texts:
+            if size:
+                content = rows[:, start + _ROW_SHIFT : start + _ROW_SHIFT + size]
+                right &= content[:, -1] == 0
+                if (content >= 0x80).any():
+                    for row in np.flatnonzero((content >= 0x80).any(axis=1)):
+                        right[row] &= _is_utf8(content[row].tobytes())
+        return right
+
+
+def _is_utf8(content: bytes) -> bool:
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
 
 def _number_extractor(primitive: str, count: int | None, start: int, order: Order) -> _Extract:
     dtype = np.dtype(PRIMITIVES[primitive])
@@ -64,53 +88,48 @@ def _number_extractor(primitive: str, count: int | None, start: int, order: Orde
     return lambda rows: rows.view(foreign)[:, first : first + count].astype(native)
 
 
-def _decode_texts(raw: NDArray[np.uint8], where: str) -> Column:
-    """Return rows of bytes, shape (messages, bytes), as strings."""
+def _decode_texts(raw: NDArray[np.uint8]) -> Column:
+    """Return rows of valid UTF-8, shape (messages, bytes), as strings."""
     messages, size = raw.shape
     if size == 0:
         return np.full(messages, "", "U1")
     if (raw < 0x80).all():
         return raw.astype(np.uint32).view(f"U{size}")[:, 0]
     joined = np.ascontiguousarray(raw).view(f"V{size}")[:, 0].tolist()
-    decoded: dict[bytes, str] = {}
-    try:
-        for text in joined:
-            if text not in decoded:
-                decoded[text] = text.decode()
-    except UnicodeDecodeError:
-        raise BagError(f"{where}: a string is not UTF-8: the bag is damaged, run `tdof-npid recover`") from None
+    decoded = {text: text.decode() for text in set(joined)}
     return np.array([decoded[text] for text in joined])
 
 
-def _text_extractor(start: int, size: int, where: str) -> _Extract:
+def _text_extractor(span: Span) -> _Extract:
+    start, size = span
     first = start + _ROW_SHIFT
     last = first + max(size - 1, 0)
-
-    def extract(rows: _Rows) -> Column:
-        if size and rows[:, last].any():
-            raise BagError(f"{where}: a string has no closing zero: the bag is damaged, run `tdof-npid recover`")
-        return _decode_texts(rows[:, first:last], where)
-
-    return extract
+    return lambda rows: _decode_texts(rows[:, first:last])
 
 
-def _texts_extractor(spans: Sequence[tuple[int, int]], where: str) -> _Extract:
-    members = [_text_extractor(start, size, where) for start, size in spans]
+def _stacked(members: Sequence[_Extract], none: np.dtype[Any]) -> _Extract:
+    """Put what there is of each element of an array side by side; `none` is the type where there are no elements."""
 
     def extract(rows: _Rows) -> Column:
         if not members:
-            return np.empty((len(rows), 0), "U1")
-        return np.stack([member(rows) for member in members], axis=1)
+            return np.empty((len(rows), 0), none)
+        columns = [member(rows) for member in members]
+        if len({column.shape for column in columns}) == 1 and columns[0].dtype != object:
+            return np.stack(columns, axis=1)
+        whole = np.empty(len(rows), object)
+        for row in range(len(rows)):
+            whole[row] = [column[row] for column in columns]
+        return whole
 
     return extract
 
 
-def _object_extractor(definition: Definition, field: Field, start: int, size: int, where: str) -> _Extract:
+def _object_extractor(definition: Definition, field: Field, start: int, size: int) -> _Extract:
     def extract(rows: _Rows) -> Column:
         column = np.empty(len(rows), object)
         for index, row in enumerate(rows):
-            message = row[_ROW_SHIFT : _ROW_SHIFT + size]
-            column[index] = read_field(definition, field, CdrCursor(message.data, where, start))
+            cursor = CdrCursor(row[_ROW_SHIFT : _ROW_SHIFT + size].data, field.name, start)
+            column[index] = walk_field(definition, field, cursor, ValueBuilder(cursor))
         return column
 
     return extract
@@ -120,59 +139,74 @@ def _stamp_extractor(seconds: _Extract, nanoseconds: _Extract) -> _Extract:
     return lambda rows: seconds(rows).astype(np.int64) * 1_000_000_000 + nanoseconds(rows)
 
 
-class _LayoutWalker:
-    """Walks one message and notes where its fields lie."""
+_Extractors = dict[str, _Extract]  # by path
 
-    def __init__(self, definition: Definition, wanted: frozenset[str], message: memoryview, where: str) -> None:
+
+class _LayoutBuilder:
+    """Notes where the fields of one message lie; those that are not wanted are left out."""
+
+    def __init__(self, definition: Definition, wanted: Mapping[str, Sequence[str]], cursor: CdrCursor) -> None:
         self._definition = definition
         self._wanted = wanted
-        self._size = len(message)
-        self._where = where
-        self._cursor = CdrCursor(message, where)
+        self._cursor = cursor
 
-    def layout(self) -> Layout:
-        """Return the message's layout."""
-        extractors = tuple(
-            (path, extract) for path, extract in self._message(self._definition.root, "") if path in self._wanted
-        )
-        positions = np.array([position for position, _ in self._cursor.lengths], np.int64)
-        lengths = np.array([value for _, value in self._cursor.lengths], np.uint32)
-        return Layout(self._cursor.order, (positions + _ROW_SHIFT) // 4, lengths, extractors)
+    def numbers(self, path: str, field: Field, start: int, count: int) -> _Extractors:
+        """Of numbers."""
+        if path not in self._wanted:
+            return {}
+        array = None if field.count is None else count
+        return {path: _number_extractor(field.type, array, start, self._cursor.order)}
 
-    def end(self) -> None:
-        """Check that the message ends where its last field does."""
-        self._cursor.end()
+    def texts(self, path: str, field: Field, spans: list[Span]) -> _Extractors:
+        """Of strings."""
+        if path not in self._wanted:
+            return {}
+        members = [_text_extractor(span) for span in spans]
+        return {path: members[0] if field.count is None else _stacked(members, np.dtype("U1"))}
 
-    def _message(self, type_name: str, prefix: str) -> Iterator[tuple[str, _Extract]]:
-        fields = self._definition.fields(type_name)
-        if not fields:
-            self._cursor.skip(1)
-        for field in fields:
-            path = prefix + field.name
-            if field.type in self._definition.types and field.count is None:
-                inner = list(self._message(field.type, path + "."))
-                if field.type in TIMES:
-                    yield path, _stamp_extractor(inner[0][1], inner[1][1])
-                yield from inner
-            else:
-                yield path, self._leaf(field, f"{self._where}, field {path}")
+    def messages(self, path: str, field: Field, start: int, parts: list[_Extractors]) -> _Extractors:
+        """Of a message within, or of each in an array."""
+        if path not in self._wanted:
+            return parts[0] if field.count is None else {}
+        if field.count is None:
+            return {**parts[0], path: _stamp_extractor(parts[0][f"{path}.sec"], parts[0][f"{path}.nanosec"])}
+        found = {path: _object_extractor(self._definition, field, start, len(self._cursor.data))}
+        for inner in self._wanted[path]:
+            none = _element_dtype(self._definition.paths[inner])
+            found[inner] = _stacked([part[inner] for part in parts], none)
+        return found
 
-    def _leaf(self, field: Field, where: str) -> _Extract:
-        cursor = self._cursor
-        if field.type in PRIMITIVES:
-            size = int(PRIMITIVES[field.type][1])
-            count = cursor.length(size) if field.count == -1 else field.count
-            total = 1 if count is None else count
-            start = cursor.skip(total * size, size if total else 1)
-            return _number_extractor(field.type, count, start, cursor.order)
-        if field.type == STRING and field.count is None:
-            return _text_extractor(*cursor.string(), where)
-        if field.type == STRING:
-            count = cursor.length(4) if field.count == -1 else field.count or 0
-            return _texts_extractor([cursor.string() for _ in range(count)], where)
-        start = cursor.position
-        read_field(self._definition, field, cursor)
-        return _object_extractor(self._definition, field, start, self._size, where)
+    def message(self, type_name: str, parts: list[tuple[Field, _Extractors]]) -> _Extractors:
+        """Of one message's fields together."""
+        found: _Extractors = {}
+        for _, part in parts:
+            if part:
+                found.update(part)
+        return found
+
+
+def _element_dtype(field: Field) -> np.dtype[Any]:
+    """Of a value of this field, where a column has none to go by."""
+    if field.type in PRIMITIVES:
+        return np.dtype(bool if field.type == "bool" else PRIMITIVES[field.type])
+    return np.dtype("U1" if field.type == STRING else np.int64 if field.type in TIMES else object)
+
+
+def _paths_to_visit(definition: Definition, asked: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The paths that must be visited for those asked for; with each array of messages, those beneath it."""
+    visited: dict[str, tuple[str, ...]] = {}
+    for path in asked:
+        visited[path] = ()
+        if definition.paths[path].type in TIMES:
+            visited |= {f"{path}.sec": (), f"{path}.nanosec": ()}
+    for path in list(visited):
+        parts = path.split(".")
+        for length in range(1, len(parts)):
+            above = ".".join(parts[:length])
+            field = definition.paths.get(above)
+            if field is not None and field.count is not None:
+                visited[above] = (*visited.get(above, ()), path)
+    return visited
 
 
 class _Gathered:
@@ -203,71 +237,94 @@ class _Gathered:
         else:
             self._parts.append((rows, column))
 
-    def finish(self, count: int) -> Column:
-        """Return the column."""
+    def finish(self, count: int, skipped: scan.Ints) -> Column:
+        """Return the column of `count` values; the rows `skipped` have none."""
         whole, self._whole = self._whole, None
         if whole is not None:
             if self._filled == count:
                 return whole[:count]
             self._parts.insert(0, (np.arange(self._filled), whole[: self._filled]))
+        if skipped.size:
+            self._parts = [(rows - np.searchsorted(skipped, rows), column) for rows, column in self._parts]
         return _join(self._parts, count)
 
 
+@dataclass(frozen=True)
+class Skipped:
+    """Messages of one topic that cannot be decoded; `reason` is the first one's."""
+
+    count: int
+    reason: str
+
+
 class ColumnBuilder:
-    """Gathers a topic's messages, piece after piece, into columns."""
+    """Gathers a topic's messages, piece after piece, into columns. Those that cannot be decoded are left out.
+
+    Attributes:
+        count: messages so far.
+        skipped: how many of them cannot be decoded, and why; None as long as all can.
+        size: bytes in the columns so far.
+    """
 
     def __init__(self, definition: Definition, fields: Sequence[str] | None, where: str, expected: int = 0) -> None:
         """Prepare to decode `fields` (flattened paths), by default all, of `expected` messages.
 
-        Raises
-        ------
-        BagError
-            There is no such field.
+        Raises:
+            BagError: there is no such field.
         """
         times = (LOG_TIME, PUBLISH_TIME, SEQUENCE)
-        known = [path for path in definition.paths() if path not in times]
-        unknown = [name for name in fields or () if name not in known and name not in times]
-        if unknown:
-            raise BagError(f"{where}: no field {unknown[0]!r}: choose from {', '.join([*times, *known])}")
-        self._paths = [path for path in known if fields is None or path in fields]
+        if fields is None:
+            self._paths = [path for path in definition.columns if path not in times]
+        else:
+            unknown = [name for name in fields if name not in definition.paths and name not in times]
+            if unknown:
+                known = choices([*times, *definition.paths])
+                raise BagError(f"{where}: no field {shown(unknown[0])!r}: choose from {known}")
+            self._paths = [path for path in definition.paths if path in fields and path not in times]
         self._definition = definition
-        self._wanted = frozenset(self._paths)
+        self._visited = _paths_to_visit(definition, self._paths)
         self._where = where
         self._columns = {path: _Gathered(expected) for path in self._paths}
         self._times: list[tuple[scan.Ints, scan.Ints]] = []
         self._sequence: list[scan.Ints] | None = [] if SEQUENCE in (fields or ()) else None
+        self._skipped_rows: list[int] = []
+        self._reason = ""
         self.count = 0
-        self.size = 0  # bytes in the columns so far
+        self.size = 0
+
+    @property
+    def skipped(self) -> Skipped | None:
+        """What cannot be decoded."""
+        return Skipped(len(self._skipped_rows), self._reason) if self._skipped_rows else None
 
     def add(self, table: scan.Table) -> None:
-        """Decode the messages of a table.
-
-        Raises
-        ------
-        BagError
-            A message is damaged or of another type.
-        """
+        """Decode the messages of a table."""
         rows = np.arange(self.count, self.count + table.length.size)
         self.count += table.length.size
         self._times.append((table.log_time, table.publish_time))
         self.size += 16 * table.length.size
         if self._sequence is not None:
             self._sequence.append(table.sequence.astype(np.int64))
-        if not self._paths:
-            return
         for size in np.unique(table.length):
             which = table.length == size
-            if size < HEAD_BYTES:
-                raise BagError(f"{self._where}: a message of {size} bytes has no CDR head: the bag is damaged")
-            self._add_rows(rows[which], scan.gather(table.data, table.offset[which], int(size)), int(size))
+            least = HEAD_BYTES + self._definition.least[self._definition.root]
+            if size < least:
+                self._skip(rows[which], f"a message of {size} bytes, where its type takes at least {least}")
+            else:
+                self._add_rows(rows[which], scan.gather(table.data, table.offset[which], int(size)), int(size))
 
     def finish(self) -> Columns:
-        """Return the columns in log-time order: `log_time`, `publish_time`, and the fields."""
+        """Return the columns in log-time order: `log_time`, `publish_time`, and the fields.
+
+        A publish time of 0 is none: the log time stands in its place.
+        """
         columns: Columns = {}
-        empty = np.empty(0, np.int64)
-        log_time = np.concatenate([empty, *(times[0] for times in self._times)])
-        publish_time = np.concatenate([empty, *(times[1] for times in self._times)])
+        skipped = np.array(sorted(self._skipped_rows), np.int64)
+        log_time = _without(skipped, [times[0] for times in self._times])
+        publish_time = _without(skipped, [times[1] for times in self._times])
         self._times.clear()
+        if not publish_time.all():
+            publish_time = np.where(publish_time == 0, log_time, publish_time)
         order = None
         if (log_time[1:] < log_time[:-1]).any():
             order = np.argsort(log_time, kind="stable")
@@ -275,20 +332,29 @@ class ColumnBuilder:
         columns[LOG_TIME] = log_time
         columns[PUBLISH_TIME] = publish_time
         if self._sequence is not None:
-            sequence = np.concatenate([empty, *self._sequence])
+            sequence = _without(skipped, self._sequence)
             columns[SEQUENCE] = sequence if order is None else sequence[order]
-        if not self.count:
+        if not log_time.size:
             return columns | self._empty()
         for path in self._paths:
-            column = self._columns.pop(path).finish(self.count)
+            column = self._columns.pop(path).finish(log_time.size, skipped)
             columns[path] = column if order is None else column[order]
         return columns
+
+    def _skip(self, rows: scan.Ints, reason: str = "") -> None:
+        self._reason = self._reason or reason
+        self._skipped_rows.extend(rows.tolist())
 
     def _add_rows(self, rows: scan.Ints, block: _Rows, size: int) -> None:
         for _ in range(_LAYOUT_TRIES):
             if not rows.size:
                 return
             layout = self._layout(block[0], size)
+            if layout is None:
+                other = (block != block[0]).any(axis=1)
+                self._skip(rows[~other])
+                rows, block = rows[other], block[other]
+                continue
             same = layout.matches(block)
             if same.all():
                 self._extract(layout, rows, block)
@@ -298,18 +364,34 @@ class ColumnBuilder:
         groups: dict[tuple[str, bytes, bytes], tuple[Layout, list[int]]] = {}
         for index in range(rows.size):
             layout = self._layout(block[index], size)
-            groups.setdefault(layout.key(), (layout, []))[1].append(index)
+            if layout is None:
+                self._skip(rows[index : index + 1])
+            else:
+                groups.setdefault(layout.key(), (layout, []))[1].append(index)
         for layout, members in groups.values():
             self._extract(layout, rows[members], block[members])
 
-    def _layout(self, row: NDArray[np.uint8], size: int) -> Layout:
-        message = row[_ROW_SHIFT : _ROW_SHIFT + size].data
-        walker = _LayoutWalker(self._definition, self._wanted, message, self._where)
-        layout = walker.layout()
-        walker.end()
-        return layout
+    def _layout(self, row: NDArray[np.uint8], size: int) -> Layout | None:
+        """Return the layout of a message, None when it cannot be decoded."""
+        try:
+            return self._layout_of(row[_ROW_SHIFT : _ROW_SHIFT + size].data)
+        except BagError as error:
+            self._reason = self._reason or str(error)
+            return None
+
+    def _layout_of(self, message: memoryview) -> Layout:
+        cursor = CdrCursor(message, "a message")
+        found = walk(self._definition, cursor, _LayoutBuilder(self._definition, self._visited, cursor))
+        positions = np.array([position for position, _ in cursor.lengths], np.int64)
+        lengths = np.array([value for _, value in cursor.lengths], np.uint32)
+        extractors = tuple((path, found[path]) for path in self._paths)
+        return Layout(cursor.order, (positions + _ROW_SHIFT) // 4, lengths, cursor.texts, extractors)
 
     def _extract(self, layout: Layout, rows: scan.Ints, block: _Rows) -> None:
+        valid = layout.valid(block)
+        if not valid.all():
+            self._skip(rows[~valid], "a string has no closing zero or is not UTF-8")
+            rows, block = rows[valid], block[valid]
         for path, extract in layout.extractors:
             column = extract(block)
             self.size += column.nbytes
@@ -323,8 +405,13 @@ class ColumnBuilder:
         message = np.zeros(size, np.uint8)
         message[1] = 1  # little-endian
         row = scan.gather(message, np.zeros(1, np.int64), size)
-        walker = _LayoutWalker(self._definition, self._wanted, message.data, self._where)
-        return {path: extract(row)[:0] for path, extract in walker.layout().extractors}
+        return {path: extract(row)[:0] for path, extract in self._layout_of(message.data).extractors}
+
+
+def _without(skipped: scan.Ints, parts: Sequence[scan.Ints]) -> scan.Ints:
+    """Join the parts and leave some rows out."""
+    whole = np.concatenate([np.empty(0, np.int64), *parts])
+    return np.delete(whole, skipped) if skipped.size else whole
 
 
 def _join(parts: Sequence[tuple[scan.Ints, Column]], count: int) -> Column:

@@ -344,8 +344,9 @@ class McapFile:
             sum(counts.values()) != statistics.message_count
             or chunks != statistics.chunk_count
             or counts.keys() - self._channels.keys()
+            or {channel.schema_id for channel in self._channels.values()} - {0, *self._schemas}
         ):
-            self._count()  # the summary leaves something out, as it may
+            self._count()  # the summary leaves something out, as it may: it is in the chunks
             if self._message_count() != statistics.message_count:
                 raise BagError(
                     f"{self.path}: holds {self._message_count()} messages where its summary says"
@@ -392,20 +393,16 @@ class McapFile:
     def _set_topics(self, counts: Mapping[int, int]) -> None:
         for channel in self._channels.values():
             schema = self._schemas.get(channel.schema_id)
-            if schema is None:
-                raise BagError(f"{self.path}: topic {channel.topic} is of a type not announced: {_DAMAGED}")
-            count = counts.get(channel.id, 0)
-            known = self.topics.get(channel.topic)
-            if known is not None:
-                if known.type != schema.name:
-                    raise BagError(f"{self.path}: topic {channel.topic} is of two types: {_DAMAGED}")
-                count += known.count
-            self.topics[channel.topic] = TopicInfo(
+            encoding = channel.message_encoding or "no known encoding"
+            info = TopicInfo(
                 channel.topic,
-                schema.name,
-                count,
-                str(schema.data, "utf-8", "replace"),
-                schema.encoding if channel.message_encoding == "cdr" else channel.message_encoding,
+                schema.name if schema else "",
+                counts.get(channel.id, 0),
+                str(schema.data, "utf-8", "replace") if schema else "",
+                (schema.encoding if schema else "") if channel.message_encoding == "cdr" else encoding,
                 channel.metadata.get("offered_qos_profiles", ""),
                 channel.metadata.get("topic_type_hash", ""),
+                "" if schema or not channel.schema_id else f"its schema {channel.schema_id} is nowhere in the file",
             )
+            known = self.topics.get(channel.topic)
+            self.topics[channel.topic] = known.joined(info) if known else info

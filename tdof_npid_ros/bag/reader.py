@@ -6,7 +6,7 @@ import heapq
 import re
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from tdof_npid_ros.bag import metadata
-from tdof_npid_ros.bag.cdr import decode
-from tdof_npid_ros.bag.columns import ColumnBuilder, Columns
-from tdof_npid_ros.bag.definition import Definition, parse
-from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.cdr import decode_with
+from tdof_npid_ros.bag.columns import ColumnBuilder, Columns, Skipped
+from tdof_npid_ros.bag.definition import Definition
+from tdof_npid_ros.bag.errors import BagError, choices, shown
 from tdof_npid_ros.bag.mcap_file import McapFile
 from tdof_npid_ros.bag.scan import Table
 from tdof_npid_ros.bag.sqlite_file import SqliteFile
@@ -35,10 +35,8 @@ _SUFFIXES: Final = (".mcap", ".db3")
 def bag_files(path: Path) -> list[Path]:
     """Return the files of a bag: of a folder the `.mcap` or `.db3` files in the order they were written.
 
-    Raises
-    ------
-    BagError
-        There is no bag at this path.
+    Raises:
+        BagError: there is no bag at this path.
     """
     if path.is_file():
         return [path]
@@ -58,35 +56,30 @@ def _split_digits(name: str) -> list[str]:
 class BagReader:
     """One or more bags, read as one. Use it as a context manager.
 
-    Attributes
-    ----------
-    topics
-        `TopicInfo` by name, counts summed over all files.
-    start_ns, end_ns
-        Log times of the first and last message; both 0 when there is none.
-    metadata
-        Named records of key-value pairs (`BagWriter.write_metadata`), in order.
-    custom_data
-        What `metadata.yaml` holds for users.
-    truncated
-        Whether a file ends before its end, as after a crash. What it holds is read all the same.
-    missing
-        What the truncated files lack, a line for each thing.
+    Attributes:
+        topics: `TopicInfo` by name, counts summed over all files.
+        start_ns, end_ns: log times of the first and last message; both 0 when there is none.
+        metadata: named records of key-value pairs (`BagWriter.write_metadata`), in order.
+        custom_data: what `metadata.yaml` holds for users.
+        truncated: whether a file ends before its end, as after a crash. What it holds is read all the same.
+        missing: what the truncated files lack, a line for each thing.
+        unreadable: for each topic whose messages cannot be decoded, the reason; the other topics do not suffer.
+        skipped: for each topic read so far, how many of its messages cannot be decoded, and why; they were left out.
     """
 
     def __init__(self, *paths: str | Path) -> None:
         """Open bag folders, `.mcap` and `.db3` files.
 
-        Raises
-        ------
-        BagError
-            A path is no bag, or a file is damaged. That a recording was cut off is no error.
+        Raises:
+            BagError: a path is no bag, or a file is damaged. That a recording was cut off is no error.
         """
         self.topics: dict[str, TopicInfo] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.custom_data: dict[str, str] = {}
         self.missing: list[str] = []
+        self.skipped: dict[str, Skipped] = {}
         self._files: list[Storage] = []
+        self._fields: dict[str, Definition] = {}
         try:
             for path in map(Path, paths):
                 self._open(path)
@@ -98,6 +91,17 @@ class BagReader:
         filled = [file for file in self._files if any(topic.count for topic in file.topics.values())]
         self.start_ns = min((file.start_ns for file in filled), default=0)
         self.end_ns = max((file.end_ns for file in filled), default=0)
+
+    @cached_property
+    def unreadable(self) -> dict[str, str]:
+        """Topics that cannot be decoded, and why."""
+        reasons: dict[str, str] = {}
+        for name in self.topics:
+            try:
+                self._definition(name)
+            except BagError as error:
+                reasons[name] = str(error)
+        return reasons
 
     @property
     def truncated(self) -> bool:
@@ -124,22 +128,16 @@ class BagReader:
     ) -> Iterator[Message]:
         """Yield messages in log-time order, those of equal times in the order of the files.
 
-        Parameters
-        ----------
-        topics
-            By default all.
-        start_ns, stop_ns
-            Log times to begin with and to end before.
+        Args:
+            topics: by default all, also those that cannot be decoded.
+            start_ns, stop_ns: log times to begin with and to end before.
 
-        Yields
-        ------
-        Topic, log time and publish time in nanoseconds, and the serialized message (a view, 4-byte head
-        included).
+        Yields:
+            Topic, log time and publish time in nanoseconds (the log time where the bag has no publish time), and the
+            serialized message (a view, 4-byte head included).
 
-        Raises
-        ------
-        BagError
-            There is no such topic, or the bag is damaged.
+        Raises:
+            BagError: there is no such topic, or the bag is damaged.
         """
         wanted = frozenset(self.topics if topics is None else topics)
         for topic in wanted:
@@ -158,55 +156,84 @@ class BagReader:
         )
         return _merge(waiting, wanted, start_ns, stop_ns)
 
+    def decoded(self, topic: str) -> Iterator[tuple[int, int, dict[str, Any]]]:
+        """Yield a topic's messages as dicts, in log-time order; those that cannot be decoded go to `skipped`.
+
+        Yields:
+            Log time and publish time in nanoseconds, and the message; see `cdr.decode`.
+
+        Raises:
+            BagError: there is no such topic, it cannot be decoded at all, or the bag is damaged.
+        """
+        definition = self._definition(topic)
+        skipped = 0
+        for _, log_time, publish_time, data in self.messages([topic]):
+            try:
+                message = decode_with(definition, data)
+            except BagError as error:
+                skipped += 1
+                first = self.skipped[topic].reason if skipped > 1 else str(error)
+                self.skipped[topic] = Skipped(skipped, first)
+                continue
+            yield log_time, publish_time, message
+
     def columns(self, topic: str, fields: Sequence[str] | None = None) -> Columns:
         """Return a topic's messages as arrays by field path, in log-time order.
 
-        Parameters
-        ----------
-        topic
-            Its name.
-        fields
-            Flattened paths such as "position" or "header.frame_id", by default all. A stamp can be read
-            whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", ".nanosec").
-            "publication_sequence", only when asked for: the publisher's count of its messages (int64), 0
-            where the bag does not hold it.
+        Messages that cannot be decoded are left out; `skipped` tells how many, and why.
 
-        Returns
-        -------
-        "log_time" and "publish_time" (int64, nanoseconds), and for each field, with n messages:
+        Args:
+            topic: its name.
+            fields: flattened paths such as "position", "header.frame_id" or, through an array of messages,
+                "points.positions"; see `fields`. By default all but those beneath arrays of messages. A stamp can be
+                read whole ("header.stamp": int64, nanoseconds) or in parts ("header.stamp.sec", ".nanosec").
+                "publication_sequence", only when asked for: the publisher's count of its messages (int64), 0 where
+                the bag does not hold it.
 
-        * a number: shape (n,), its own type;
-        * an array of numbers, of the same length m in all messages: shape (n, m);
-        * a string: shape (n,), NumPy `str`; an array of m strings: shape (n, m);
-        * anything else, that is arrays whose lengths vary, arrays of messages (as lists of dicts), and
-          strings of very different lengths: shape (n,), objects.
+        Returns:
+            "log_time" and "publish_time" (int64, nanoseconds; the log time where the bag has no publish time), and
+            for each field, with n messages:
 
-        Raises
-        ------
-        BagError
-            There is no such topic or field, the bag is damaged, or the columns need more memory than is free.
+            * a number: shape (n,), its own type;
+            * an array of numbers, of the same length m in all messages: shape (n, m);
+            * a string: shape (n,), NumPy `str`; an array of m strings: shape (n, m);
+            * a field of each of m messages in an array: shape (n, m), or (n, m, k) if the field is an array;
+            * anything else, that is arrays whose lengths vary, arrays of messages (as lists of dicts), and
+              strings of very different lengths: shape (n,), objects.
+
+        Raises:
+            BagError: there is no such topic or field, the topic cannot be decoded at all, the bag is damaged, or the
+                columns need more memory than is free.
         """
-        builder = ColumnBuilder(self._definition(topic), fields, f"topic {topic}", self.topics[topic].count)
+        builder = ColumnBuilder(self._definition(topic), fields, f"topic {shown(topic)}", self.topics[topic].count)
         limit = _free_memory_bytes()
         try:
             for file in self._files:
                 if topic in file.topics:
                     self._add_columns(builder, file, topic, limit)
+            if builder.skipped is not None:
+                self.skipped[topic] = builder.skipped
             return builder.finish()
         except MemoryError:
-            raise BagError(f"topic {topic}: its columns need more memory than there is: read fewer fields") from None
+            raise BagError(
+                f"topic {shown(topic)}: its columns need more memory than there is: read fewer fields"
+            ) from None
+
+    def fields(self, topic: str) -> dict[str, str]:
+        """Return what `columns` can read of a topic: types such as "float64[]" by flattened path.
+
+        Raises:
+            BagError: there is no such topic, or it cannot be decoded at all.
+        """
+        return {path: str(field) for path, field in self._definition(topic).paths.items()}
 
     def decode(self, topic: str, data: bytes | bytearray | memoryview) -> dict[str, Any]:
         """Return one message of a topic as a dict; see `cdr.decode`.
 
-        Raises
-        ------
-        BagError
-            There is no such topic, or the message or the definition is damaged.
+        Raises:
+            BagError: there is no such topic, or the message or the definition is damaged.
         """
-        self._definition(topic)
-        info = self.topics[topic]
-        return decode(info.type, info.definition, data)
+        return decode_with(self._definition(topic), data)
 
     def _open(self, path: Path) -> None:
         if path.is_dir():
@@ -223,37 +250,23 @@ class BagReader:
             self.metadata.extend(file.metadata)
             self.missing.extend(file.missing)
             for topic in file.topics.values():
-                known = self.topics.setdefault(topic.name, replace(topic, count=0))
-                if known.type != topic.type:
-                    raise BagError(
-                        f"{name}: topic {topic.name} is of type {topic.type}, elsewhere {known.type}: read them apart"
-                    )
-                self.topics[topic.name] = replace(known, count=known.count + topic.count)
+                known = self.topics.get(topic.name)
+                self.topics[topic.name] = known.joined(topic) if known else topic
 
     def _topic(self, topic: str) -> TopicInfo:
         if topic not in self.topics:
-            raise BagError(f"no topic {topic!r} in the bag: choose from {', '.join(sorted(self.topics)) or 'none'}")
+            raise BagError(f"no topic {shown(topic)!r} in the bag: choose from {choices(sorted(self.topics))}")
         return self.topics[topic]
 
     def _definition(self, topic: str) -> Definition:
-        """Return what the files agree that a topic's messages are."""
-        self._topic(topic)
-        agreed: Definition | None = None
-        for file in self._files:
-            info = file.topics.get(topic)
-            if info is None:
-                continue
-            if info.encoding != "ros2msg":
-                raise BagError(
-                    f"{file.name}: topic {topic} is in {info.encoding or 'an unknown format'}, not CDR with a"
-                    " definition in ros2msg: its messages cannot be decoded"
-                )
-            definition = parse(info.type, info.definition)
-            if agreed is not None and definition.types != agreed.types:
-                raise BagError(f"{file.name}: topic {topic} has other fields than in the files before: read them apart")
-            agreed = definition
-        assert agreed is not None
-        return agreed
+        """Return what a topic's messages hold."""
+        info = self._topic(topic)
+        if topic not in self._fields:
+            try:
+                self._fields[topic] = info.fields()
+            except BagError as error:
+                raise BagError(f"topic {shown(topic)} cannot be decoded: {error}") from None
+        return self._fields[topic]
 
     def _add_columns(self, builder: ColumnBuilder, file: Storage, topic: str, limit: int) -> None:
         before = builder.count
@@ -265,12 +278,12 @@ class BagReader:
                 builder.add(table if mine.all() else table.only(mine))
             if builder.size > limit:
                 raise BagError(
-                    f"topic {topic}: its columns need more than the {limit >> 20} MiB of memory that are"
+                    f"topic {shown(topic)}: its columns need more than the {limit >> 20} MiB of memory that are"
                     " free: read fewer fields"
                 )
         if builder.count - before != file.topics[topic].count:
             raise BagError(
-                f"{file.name}: {builder.count - before} messages of topic {topic} where the summary says"
+                f"{file.name}: {builder.count - before} messages of topic {shown(topic)} where the summary says"
                 f" {file.topics[topic].count}: the file is damaged, run `tdof-npid recover`"
             )
 
@@ -304,7 +317,7 @@ def _rows(table: Table, file: Storage, wanted: frozenset[str], start_ns: int, st
         for channel, log_time, publish_time, offset, length in zip(
             block.channel.tolist(),
             block.log_time.tolist(),
-            block.publish_time.tolist(),
+            np.where(block.publish_time == 0, block.log_time, block.publish_time).tolist(),
             block.offset.tolist(),
             block.length.tolist(),
             strict=True,

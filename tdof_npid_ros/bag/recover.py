@@ -118,7 +118,7 @@ class _Recovery:
         return {topic: gaps.lost for topic, gaps in self._gaps.items() if gaps.lost is not None}
 
     def _announce(self, topic: TopicInfo, file: McapFile) -> None:
-        if topic.encoding != RECOVERABLE:
+        if topic.encoding != RECOVERABLE or topic.problem:
             what = f"{topic.count} messages of topic {topic.name}, in {topic.encoding or 'an unknown format'}"
             self.missing.append(f"{file.path}: {what}, not CDR with a definition in ros2msg")
         elif topic.name not in self._topic_ids:
@@ -128,7 +128,7 @@ class _Recovery:
             self.messages[topic.name] = 0
 
     def _copy_table(self, table: Table, file: McapFile) -> None:
-        names = {channel: name for channel, name in file.topic_of.items() if file.topics[name].encoding == RECOVERABLE}
+        names = {channel: name for channel, name in file.topic_of.items() if name in self._topic_ids}
         ids = {channel: self._topic_ids[name] for channel, name in names.items()}
         table = table.only(np.isin(table.channel, list(ids)))
         if not table.log_time.size:

@@ -11,13 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from tdof_npid_ros.bag.definition import PRIMITIVES, STRING
-from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.definition import SEPARATOR, is_nested, parse_fields
+from tdof_npid_ros.bag.errors import BagError, shown
 
-SEPARATOR: Final = "=" * 80
-
-_PRIMITIVES: Final = frozenset((*PRIMITIVES, STRING, "wstring"))
-_FIELD: Final = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]", re.MULTILINE)
 _NAME: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:/(msg|srv|action))?/([A-Za-z][A-Za-z0-9_]*)")
 
 
@@ -31,36 +27,28 @@ def _share_folders() -> Iterator[Path]:
 def _interface_file(type_name: str, suffix: str) -> Path:
     match = _NAME.fullmatch(type_name)
     if match is None:
-        raise BagError(f"{type_name!r} is no message type: write it as package/msg/Type")
+        raise BagError(f"{shown(type_name)!r} is no message type: write it as package/msg/Type")
     package, kind, name = match.groups()
+    kind = kind or "msg"
     for share in _share_folders():
-        path = share / package / (kind or "msg") / f"{name}{suffix}"
+        path = share / package / kind / f"{name}{suffix}"
         if path.is_file():
             return path
     raise BagError(
-        f"message type {type_name!r} is not installed: no {package}/{kind or 'msg'}/{name}{suffix} under"
-        f" AMENT_PREFIX_PATH or {sys.prefix}/share; install the package {package!r}"
+        f"message type {shown(type_name)!r} is not installed: no {shown(f'{package}/{kind}/{name}{suffix}')}"
+        f" under AMENT_PREFIX_PATH or {sys.prefix}/share; install the package {shown(package)!r}"
     )
-
-
-def _dependencies(definition: str, package: str) -> list[str]:
-    names = {name for name in _FIELD.findall(definition) if name not in _PRIMITIVES}
-    return sorted(name if "/" in name else f"{package}/{name}" for name in names)
 
 
 @cache
 def definition(type_name: str) -> str:
     """Return the full definition of a type, all nested types included, as rosbag2 stores it (`ros2msg`).
 
-    Parameters
-    ----------
-    type_name
-        For example "sensor_msgs/msg/JointState".
+    Args:
+        type_name: for example "sensor_msgs/msg/JointState".
 
-    Raises
-    ------
-    BagError
-        The type, or one it contains, is not installed or cannot be read.
+    Raises:
+        BagError: the type, or one it contains, is not installed or cannot be read.
     """
     seen: set[str] = set()
 
@@ -70,8 +58,9 @@ def definition(type_name: str) -> str:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise BagError(f"cannot read {path}: {error}; install its package again") from None
+        fields = parse_fields(text, name.split("/", maxsplit=1)[0], str(path))
         parts = [text]
-        for nested in _dependencies(text, name.split("/")[0]):
+        for nested in sorted({field.type for field in fields if is_nested(field.type)}):
             if nested not in seen:
                 seen.add(nested)
                 parts.append(f"\n{SEPARATOR}\nMSG: {nested}\n{expand(nested)}")
@@ -84,10 +73,8 @@ def definition(type_name: str) -> str:
 def type_hash(type_name: str) -> str:
     """Return the RIHS01 hash of a type, for example "RIHS01_a13e…".
 
-    Raises
-    ------
-    BagError
-        The type is not installed, or its description file is damaged.
+    Raises:
+        BagError: the type is not installed, or its description file is damaged.
     """
     path = _interface_file(type_name, ".json")
     try:

@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from tdof_npid_ros.analysis.compare import Comparison, Recorded
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
+from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
 from tdof_npid_ros.graph.runtime.tap import message_class
@@ -25,7 +26,6 @@ from tdof_npid_ros.wire import SECOND, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
-CDR_ENCODINGS = ("ros2msg", "ros2idl", "")  # how definitions of messages in CDR are written; bags may lack them
 FOR_CONTROLLER = ("scenario_plan", "setpoint")  # what a controller is given, besides the output
 MATCH_TIMEOUT = 10.0  # s until subscribers must have come, where an answer is needed
 REPLY_TIMEOUT = 0.5  # s until an output is published again
@@ -99,8 +99,8 @@ class ReplayNode(LoopNode):
         qos = LATCHED_QOS if self._is_latched(topic) else SIGNAL_QOS
         info = self.reader.topics[topic]
         try:
-            if info.encoding not in CDR_ENCODINGS:
-                raise ValueError(f"it is in {info.encoding}, not CDR")
+            if info.problem or info.encoding not in CDR_DEFINITIONS:
+                raise ValueError(info.problem or f"it is in {info.encoding}, not CDR")
             return self.create_publisher(message_class(info.type), self._relative(topic), qos)
         except ValueError as error:
             self.get_logger().warning(f"{topic} is not replayed: {error}")

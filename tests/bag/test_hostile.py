@@ -156,7 +156,6 @@ def test_mutated_sqlite_bags_raise_nothing_but_bag_errors(tmp_path) -> None:
         "UPDATE topics SET id = 70000",
         "UPDATE topics SET name = x'ff'",
         "UPDATE topics SET name = CAST(x'ff' AS TEXT)",
-        "UPDATE messages SET data = x'00' WHERE id = 5",
         "DROP TABLE messages",
         "DROP TABLE messages; CREATE TABLE messages"
         "(id INTEGER, topic_id INTEGER, timestamp INTEGER, data AS (zeroblob(200000000)))",
@@ -202,7 +201,7 @@ def test_any_bytes_as_a_message(type_name, head, data) -> None:
 @settings(max_examples=EXAMPLES, deadline=None)
 def test_any_text_as_a_definition(text) -> None:
     with contextlib.suppress(BagError):
-        parse("a/msg/B", text).paths()
+        assert parse("a/msg/B", text).paths is not None
 
 
 @pytest.mark.parametrize(
@@ -226,7 +225,7 @@ def test_exploding_definition_is_refused() -> None:
     types = [f"{'=' * 80}\nMSG: a/T{k}\nT{k + 1} x\nT{k + 1} y" for k in range(30)]
     text = "\n".join(["T0 x", *types, f"{'=' * 80}\nMSG: a/T30\nuint8 x"])
     with pytest.raises(BagError, match=r"more than"):
-        parse("a/msg/B", text).paths()
+        assert parse("a/msg/B", text).paths
     with pytest.raises(BagError, match=r"of a message of"):
         decode("a/msg/B", text, b"\0\1\0\0")
 
@@ -272,7 +271,7 @@ LATER = chunk(b"", 0, "")  # so that the damaged chunk is not the last, which a 
         (records.record(0x20, b""), "unknown kind 32"),
         (records.record(3, b"\1\0\xff\xff\xff\xff"), "a length of 4294967295 bytes"),
         (records.record(3, b"\1\0\2\0\0\0\xff\xfe"), "not UTF-8"),
-        (records.record(4, b"\1\0\1\0" + bytes(12)), "type not announced"),
+        (records.record(4, b"\1\0\1\0" + bytes(12)), "nowhere in the file"),
     ],
 )
 def test_hostile_records_are_refused(tmp_path, content, reason) -> None:
