@@ -24,14 +24,15 @@ from tdof_npid_ros.control.law import KD_H, KI_H, KP, PHI, coefficients
 from tdof_npid_ros.stability import StabilityError
 from tdof_npid_ros.stability.pulse import PulseTransfer, polynomial
 
-COARSE = 0.12  # spacing of the grid in ln ω
-TURN = 0.2  # most that the plant's response changes between two points: rad of its phase, or part of its magnitude
+COARSE = 0.2  # spacing of the grid in ln ω
+TURN = 0.25  # most that the plant's response changes between two points: rad of its phase, or part of its magnitude
 SLOWEST = 1e-4  # of the slowest of the plant's frequencies: where the grid begins
 MOST_POINTS = 1_000_000
 DEEPEST = 40  # halvings of a stretch of the grid
 
 _SEGMENTS = 3  # the highest peaks that are followed to their top, of S and of T each
-_GOLDEN = 16  # steps of the golden section: a peak of 1000 to 1 %
+_PEAK_STEPS = 24  # at most, towards the top of a peak
+_PEAK_WIDTH = 1e-4  # part of a peak's distance from 0 by which it may still be nearer
 _NEAREST = 1e-13  # to the circle that a mode may lie and still be told from one on it
 _STEPS = 30  # towards a mode
 # Rows of the result: see LaneMargins.
@@ -82,7 +83,7 @@ class LaneMargins:
 class Screen:
     """Margins of any number of candidates of one linear plant, with the loop's exact dead time.
 
-    A candidate costs about as much as some thousand steps of its simulation at most.
+    A candidate costs 2 to 4 µs, and as much again for its modes: a tenth of its simulation.
 
     Example:
         screen = Screen(loop_plant(case))
@@ -105,11 +106,16 @@ class Screen:
         """Of the grid."""
         return len(self._response.omega)
 
-    def __call__(self, gains: Gains) -> LaneMargins:
-        """The margins of each lane, as long as no limit is active; safe to call from several threads."""
+    def __call__(self, gains: Gains, modes: bool = True) -> LaneMargins:
+        """The margins of each lane, as long as no limit is active; safe to call from several threads.
+
+        Args:
+            gains: of any number of lanes.
+            modes: whether to look for the slowest mode, which doubles the time; without, `time_constant` is nan.
+        """
         c = coefficients(gains, self.plant.sample_period)
         found = np.empty((_RESULTS, gains.lanes))
-        _screen_lanes(self._response, c[KP], c[KI_H], c[KD_H], c[PHI], found)
+        _screen_lanes(self._response, c[KP], c[KI_H], c[KD_H], c[PHI], modes, found)
         stable = found[_STABLE] > 0.0
         h = self.plant.sample_period
         with np.errstate(divide="ignore"):
@@ -139,9 +145,10 @@ def frequency_grid(plant: PulseTransfer) -> np.ndarray:
         )
     corners = np.abs(np.concatenate([plant.poles, plant.zeros, [1.0 / plant.lag]]))
     first = SLOWEST * min(1.0, float(np.min(corners[corners > 1e-14], initial=1.0)))
-    omega = np.geomspace(first, math.pi, math.ceil(math.log(math.pi / first) / COARSE) + 1)
-    turning = np.linspace(omega[1], math.pi, math.ceil(math.pi * plant.lag / TURN) + 1)
-    omega = np.union1d(omega, turning[turning * plant.lag > 1.0])
+    even = TURN / plant.lag  # spacing from where the dead time turns faster than COARSE
+    bend = min(max(even / COARSE, first), math.pi)
+    omega = np.geomspace(first, bend, math.ceil(math.log(bend / first) / COARSE) + 1)
+    omega = np.union1d(omega, np.linspace(bend, math.pi, math.ceil((math.pi - bend) / even) + 1))
     for _ in range(DEEPEST):
         w = on_circle(omega)
         values = [polynomial(plant.a, w), polynomial(plant.b, w)]
@@ -222,28 +229,50 @@ def _loop_at_frequency(response: Any, omega: Any, c: Any) -> Any:
 
 
 @compiled
-def _magnitude(response: Any, omega: Any, c: Any, of_t: Any) -> Any:
-    """|S|², or |T|²."""
+def _inverse(response: Any, omega: Any, c: Any, of_t: Any) -> Any:
+    """1/|S|², or 1/|T|²."""
     n, d = _loop_at_frequency(response, omega, c)
-    return _squared(n if of_t else d) / _squared(n + d)
+    return _squared(n + d) / _squared(n if of_t else d)
 
 
 @compiled
-def _peak(response: Any, low: Any, high: Any, c: Any, of_t: Any) -> Any:
-    """The largest |S|² or |T|² between two frequencies, and where, by the golden section."""
-    ratio = 0.6180339887498949
-    x1, x2 = high - ratio * (high - low), low + ratio * (high - low)
-    f1, f2 = _magnitude(response, x1, c, of_t), _magnitude(response, x2, c, of_t)
-    for _ in range(_GOLDEN):
-        if f1 > f2:
-            high, x2, f2 = x2, x1, f1
-            x1 = high - ratio * (high - low)
-            f1 = _magnitude(response, x1, c, of_t)
+def _peak(response: Any, low: Any, middle: Any, high: Any, c: Any, of_t: Any) -> Any:
+    """The largest |S|² or |T|² between two frequencies, and where.
+
+    By parabolas through 1/|S|², which is nearly one where L passes -1, and golden sections where they do not serve.
+    """
+    x, f = middle, _inverse(response, middle, c, of_t)
+    x2, f2 = low, _inverse(response, low, c, of_t)
+    x3, f3 = high, _inverse(response, high, c, of_t)
+    for _ in range(_PEAK_STEPS):
+        r, q = (x - x2) * (f - f3), (x - x3) * (f - f2)
+        across = 2.0 * (q - r)
+        new = x - ((x - x3) * q - (x - x2) * r) / across if across != 0.0 else x
+        if not low < new < high or abs(new - x) > 0.6 * (high - low):
+            new = x + 0.381966 * ((high if high - x > x - low else low) - x)
+        step = abs(new - x)
+        if step < 1e-12 * x:
+            break
+        g = _inverse(response, new, c, of_t)
+        gain = f - g
+        if g <= f:
+            if new > x:
+                low = x
+            else:
+                high = x
+            x3, f3, x2, f2, x, f = x2, f2, x, f, new, g
         else:
-            low, x1, f1 = x1, x2, f2
-            x2 = low + ratio * (high - low)
-            f2 = _magnitude(response, x2, c, of_t)
-    return (f1, x1) if f1 > f2 else (f2, x2)
+            if new > x:
+                high = new
+            else:
+                low = new
+            if f2 >= f3:
+                x2, f2 = new, g
+            else:
+                x3, f3 = new, g
+        if abs(gain) < _PEAK_WIDTH * f and step < 0.02 * (high - low) + 1e-3 * x:
+            break
+    return 1.0 / f, x
 
 
 @compiled
@@ -299,25 +328,21 @@ def _nearest(p: Any, q: Any) -> Any:
 
 
 @compiled
+def _nearest_of(p: Any, q: Any, r: Any) -> Any:
+    """The least squared distance from 0 to the straight lines from p to q and from q to r."""
+    return min(_nearest(p, q), _nearest(q, r))
+
+
+@compiled
 def _keep(estimate: Any, index: Any, best: Any, where: Any) -> None:
-    """Enter a peak into the list of the highest, one of neighbours only."""
-    slot = _SEGMENTS
-    for i in range(_SEGMENTS):
-        if where[i] >= 0 and index - where[i] <= 1:
-            if estimate > best[i]:
-                best[i] = estimate
-                where[i] = index
-                while i > 0 and best[i] > best[i - 1]:
-                    best[i], best[i - 1] = best[i - 1], best[i]
-                    where[i], where[i - 1] = where[i - 1], where[i]
-                    i -= 1
-            return
-        if slot == _SEGMENTS and estimate > best[i]:
-            slot = i
-    if slot < _SEGMENTS:
-        for i in range(_SEGMENTS - 1, slot, -1):
-            best[i], where[i] = best[i - 1], where[i - 1]
-        best[slot], where[slot] = estimate, index
+    """Enter a peak into the list of the highest."""
+    i = _SEGMENTS - 1
+    if not estimate > best[i]:
+        return
+    while i > 0 and estimate > best[i - 1]:
+        best[i], where[i] = best[i - 1], where[i - 1]
+        i -= 1
+    best[i], where[i] = estimate, index
 
 
 @compiled
@@ -393,24 +418,39 @@ def _angle(x: Any) -> Any:
 
 
 @compiled
-def _crossover(margins: Any, lane: Any, before: Any, after: Any, omega_before: Any, omega: Any) -> None:
-    """Take the margins of what L crosses between two points: the negative real axis, and the unit circle."""
-    size_before, size = 0.5 * math.log(_squared(before)), 0.5 * math.log(_squared(after))
-    angle = _angle(before)
-    turn = _angle(after * before.conjugate())
+def _crossover(response: Any, c: Any, margins: Any, lane: Any, low: Any, before: Any, high: Any, after: Any) -> None:
+    """Take the margins of what L, known at two frequencies, crosses: the negative real axis, and the unit circle."""
+    angle, turn, growth = _angle(before), _angle(after * before.conjugate()), _growth(before, after)
     if (before.imag >= 0.0) != (after.imag >= 0.0):
         to_axis = (math.pi if turn > 0.0 else -math.pi) - angle
-        if abs(to_axis) <= abs(turn):
-            part = to_axis / turn if turn != 0.0 else 0.0
-            _gain(margins, lane, math.exp(size_before + part * (size - size_before)))
-    if (size_before >= 0.0) != (size >= 0.0):
-        part = size_before / (size_before - size)
-        ahead = angle + part * turn + math.pi  # from -1 counter-clockwise to L
+        if abs(to_axis) <= abs(turn) and turn != 0.0:
+            part = to_axis / turn
+            meets = _loop_between(response, c, low, high, part)
+            off = _angle(-meets)  # what is left to the axis, by the slope of the whole stretch
+            _gain(margins, lane, math.exp(0.5 * math.log(_squared(meets)) - off / turn * growth))
+    size = 0.5 * math.log(_squared(before))
+    if (size >= 0.0) != (size + growth >= 0.0):
+        part = -size / growth
+        meets = _loop_between(response, c, low, high, part)
+        off = -0.5 * math.log(_squared(meets)) / growth
+        ahead = _angle(meets) + off * turn + math.pi  # from -1 counter-clockwise to L
         ahead -= 2.0 * math.pi * math.floor(ahead / (2.0 * math.pi))
         margins[_PHASE, lane] = min(margins[_PHASE, lane], ahead, 2.0 * math.pi - ahead)
-        margins[_DELAY, lane] = min(
-            margins[_DELAY, lane], ahead / (omega_before * math.exp(part * math.log(omega / omega_before)))
-        )
+        omega = low * math.exp((part + off) * math.log(high / low))
+        margins[_DELAY, lane] = min(margins[_DELAY, lane], ahead / omega)
+
+
+@compiled
+def _growth(before: Any, after: Any) -> Any:
+    """ln|after/before|."""
+    return 0.5 * math.log(_squared(after) / _squared(before))
+
+
+@compiled
+def _loop_between(response: Any, c: Any, low: Any, high: Any, part: Any) -> Any:
+    """L at a part of the way between two frequencies, on a logarithmic scale."""
+    n, d = _loop_at_frequency(response, low * math.exp(part * math.log(high / low)), c)
+    return _quotient(n, d)
 
 
 @compiled
@@ -423,7 +463,7 @@ def _gain(margins: Any, lane: Any, size: Any) -> None:
 
 
 @entry_point
-def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, found: Any) -> None:
+def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, modes_too: Any, found: Any) -> None:
     """The margins of every lane: gains (lanes,), found (_RESULTS, lanes)."""
     points = response.omega.shape[0]
     order = response.a_polynomial.shape[0] - 1
@@ -454,9 +494,10 @@ def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, found:
         highest_s = _squared(d) / _squared(before)
         highest_t = _squared(n) / _squared(before)
         kp_size, ki_size, kd_size = abs(kp[lane]), abs(ki_h[lane]), abs(kd_h[lane])
-        omega_before = 0.0
         before *= sign
-        loop_before, squared_before = 0j, 0.0
+        two_before, loop_before, omega_before = before, 0j, 0.0
+        s_before, t_before, s_rises, t_rises = highest_s, highest_t, False, False
+        outside_before = False
         half_turns = 0
         sure = True
         finished = False
@@ -466,35 +507,33 @@ def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, found:
             omega = response.omega[i]
             if i == points - 1:
                 chi = complex(chi.real, 0.0)
-            elif before.real * chi.real + before.imag * chi.imag > 0.0:
+            if before.real * chi.real + before.imag * chi.imag > 0.0:
                 half_turns += _crossing(before, chi)
             else:
                 turns, resolved = _half_turns(response, c, omega_before, before * sign, omega, chi * sign)
                 half_turns += turns
                 sure = sure and resolved
-            squared, n_squared = _squared(d), _squared(n)
-            loop = n * d.conjugate()
-            if i > 0:
-                distance = _nearest(before, chi)
-                if distance == 0.0:
-                    sure = False
-                    break
-                estimate = max(squared, squared_before) / distance
-                if estimate > best_s[_SEGMENTS - 1]:
-                    _keep(estimate, i, best_s, where_s)
-                estimate = n_squared / distance
-                if estimate > best_t[_SEGMENTS - 1]:
-                    _keep(estimate, i, best_t, where_t)
-                if (loop.imag >= 0.0) != (loop_before.imag >= 0.0) or (n_squared >= squared) != (
-                    _squared(loop_before) >= squared_before * squared_before
-                ):
-                    _crossover(
-                        margins, lane, loop_before * (1.0 / squared_before), loop * (1.0 / squared), omega_before, omega
-                    )
             size = _squared(chi)
-            highest_s = max(highest_s, squared / size)
-            highest_t = max(highest_t, n_squared / size)
-            before, loop_before, squared_before, omega_before = chi, loop, squared, omega
+            if size == 0.0:
+                sure = False
+                break
+            squared, n_squared, inverse = _squared(d), _squared(n), 1.0 / size
+            s_size, t_size = squared * inverse, n_squared * inverse
+            if s_rises and s_size < s_before:
+                _keep(s_before * _squared(before) / _nearest_of(two_before, before, chi), i - 1, best_s, where_s)
+            if t_rises and t_size < t_before:
+                _keep(t_before * _squared(before) / _nearest_of(two_before, before, chi), i - 1, best_t, where_t)
+            s_rises, t_rises = s_size >= s_before, t_size >= t_before
+            highest_s, highest_t = max(highest_s, s_size), max(highest_t, t_size)
+            loop = n * d.conjugate()
+            outside = n_squared >= squared
+            if i > 0 and ((loop.imag >= 0.0) != (loop_before.imag >= 0.0) or outside != outside_before):
+                n_before, d_before = _loop_at(response.a[i - 1], response.b[i - 1], response.w[i - 1], c)
+                _crossover(
+                    response, c, margins, lane, omega_before, _quotient(n_before, d_before), omega, _quotient(n, d)
+                )
+            two_before, before, loop_before, omega_before = before, chi, loop, omega
+            s_before, t_before, outside_before = s_size, t_size, outside
             if i % 16 == 0 and i < points - 1:
                 # |L| from here on, w growing and with it w/s: where it is too small to matter, the rest is passed over.
                 w_size, s_size = math.sqrt(_squared(response.w[i])), math.sqrt(_squared(s0 + s1 * response.w[i]))
@@ -526,18 +565,17 @@ def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, found:
         starts[0] = 0.0
         for k in range(_SEGMENTS):
             starts[k + 1] = -1.0
-            if where_s[k] >= 0 and best_s[k] > 0.8 * highest_s:
-                low = response.omega[max(where_s[k] - 2, 0)]
-                high = response.omega[min(where_s[k] + 1, points - 1)]
-                top, at = _peak(response, low, high, c, False)
+            i = where_s[k]
+            if i >= 0 and best_s[k] > 0.9 * highest_s:
+                low = response.omega[i - 1] if i > 0 else 0.0
+                top, starts[k + 1] = _peak(response, low, response.omega[i], response.omega[i + 1], c, False)
                 highest_s = max(highest_s, top)
-                starts[k + 1] = at
-            if where_t[k] >= 0 and best_t[k] > 0.8 * highest_t:
-                low = response.omega[max(where_t[k] - 2, 0)]
-                high = response.omega[min(where_t[k] + 1, points - 1)]
-                highest_t = max(highest_t, _peak(response, low, high, c, True)[0])
-        radius = _slowest(response, starts, c, modes)
-        if not radius < 1.0 - _NEAREST:
+            i = where_t[k]
+            if i >= 0 and best_t[k] > 0.9 * highest_t:
+                low = response.omega[i - 1] if i > 0 else 0.0
+                highest_t = max(highest_t, _peak(response, low, response.omega[i], response.omega[i + 1], c, True)[0])
+        radius = _slowest(response, starts, c, modes) if modes_too else np.nan
+        if radius >= 1.0 - _NEAREST or highest_s > 1.0 / (_NEAREST * _NEAREST):
             margins[_STABLE + 1 :, lane] = np.nan
             continue
         margins[_STABLE, lane] = 1.0
