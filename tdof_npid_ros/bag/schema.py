@@ -3,41 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import sys
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Final
 
 from tdof_npid_ros.bag.definition import SEPARATOR, is_nested, parse_fields
-from tdof_npid_ros.bag.errors import BagError, shown
-
-_NAME: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:/(msg|srv|action))?/([A-Za-z][A-Za-z0-9_]*)")
-
-
-def _share_folders() -> Iterator[Path]:
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if prefix:
-            yield Path(prefix) / "share"
-    yield Path(sys.prefix) / "share"
+from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.interfaces import InterfaceError, installed_file
 
 
 def _interface_file(type_name: str, suffix: str) -> Path:
-    match = _NAME.fullmatch(type_name)
-    if match is None:
-        raise BagError(f"{shown(type_name)!r} is no message type: write it as package/msg/Type")
-    package, kind, name = match.groups()
-    kind = kind or "msg"
-    for share in _share_folders():
-        path = share / package / kind / f"{name}{suffix}"
-        if path.is_file():
-            return path
-    raise BagError(
-        f"message type {shown(type_name)!r} is not installed: no {shown(f'{package}/{kind}/{name}{suffix}')}"
-        f" under AMENT_PREFIX_PATH or {sys.prefix}/share; install the package {shown(package)!r}"
-    )
+    try:
+        return installed_file(type_name, suffix)
+    except InterfaceError as error:
+        raise BagError(str(error)) from None
 
 
 @cache

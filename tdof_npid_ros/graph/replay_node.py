@@ -21,7 +21,7 @@ from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
-from tdof_npid_ros.graph.runtime.tap import message_class
+from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.wire import SECOND, Sample
 
 CLOCK = "/clock"

@@ -31,7 +31,8 @@ from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
-from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread, message_class
+from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
+from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.wire import JOINT_STATE
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes

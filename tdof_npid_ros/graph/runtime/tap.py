@@ -6,7 +6,6 @@ then takes whatever has come in the meantime.
 
 from __future__ import annotations
 
-import importlib
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +17,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.wire import SignalReader
 
 SHORTEST_PAUSE = 0.005  # s between two looks while messages come
@@ -182,19 +182,6 @@ class TapThread:
             found.sort(key=itemgetter(0))
             self._hand_over(found)
         return bool(found)
-
-
-def message_class(type_name: str) -> Any:
-    """The class of a message type such as `sensor_msgs/msg/JointState`.
-
-    Raises:
-        ValueError: it is not installed, or it is a part of a service or an action.
-    """
-    package, _, name = type_name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError):
-        raise ValueError(f"the message type {type_name} is not installed here: install the package {package}") from None
 
 
 def _never_called(_: Any) -> None:
