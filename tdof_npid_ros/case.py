@@ -26,7 +26,7 @@ from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.parameters import OF_NODE, unknown_parameters
-from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
+from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters, named_model
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan
 
@@ -223,7 +223,7 @@ def load_case(name: str | Path) -> Case:
         case = Case(
             name=path.stem,
             sample_period_ns=sample_period_in_ns(plant.get("sample_period", DEFAULT_SAMPLE_PERIOD)),
-            model=str(plant.get("model", "first_order")),
+            model=named_model(plant.get("model", "first_order"), path.parent),
             plant_values=plant,
             effort_limits=_effort_limits(plant),
             gains=gains_from_mapping(controller),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 from functools import cache
 from pathlib import Path
-from typing import Final
 
 from tdof_npid_ros.bag.definition import SEPARATOR, is_nested, parse_fields
 from tdof_npid_ros.bag.errors import BagError

@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
+from tdof_npid_ros.one_line import one_line
+
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {
     "new": "write a commented parameter file for a plant of your own",
@@ -26,6 +28,7 @@ SUBCOMMANDS = {
     "bench": "measure the claims about speed on this machine",
 }
 USAGE_ERROR = 2
+LONGEST_ERROR = 2000  # characters
 INTERRUPTED = 130  # as a shell gives it after Ctrl-C
 READER_GONE = 141  # as a shell gives it when the reader of a pipe has gone
 
@@ -49,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return READER_GONE
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
-        print(f"tdof-npid {name}: {_one_line(error)}", file=sys.stderr)
+        print(f"tdof-npid {name}: {_message(error)}", file=sys.stderr)
         return USAGE_ERROR
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "rclpy":
@@ -77,10 +80,10 @@ def _run(given: list[str], chosen: str) -> int:
     return int(importlib.import_module(f"{__name__}.{parsed.subcommand}").run(parsed))
 
 
-def _one_line(error: Exception) -> str:
+def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+        return one_line(f"{error.filename}: {error.strerror}")
+    return one_line(error, LONGEST_ERROR)
 
 
 def entry() -> None:

@@ -7,12 +7,18 @@ import json
 from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.output_file import check_outputs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help="bag folders, .mcap or .db3 files; several are compared")
+    parser.add_argument(
+        "--case",
+        metavar="FILE",
+        help="parameter file that names the class of the bag's plant, for the comparison with the simulation",
+    )
     parser.add_argument("--png", type=Path, metavar="FILE", help="picture of setpoint, output and effort")
     parser.add_argument("--html", type=Path, metavar="FILE", help="one page with interactive plots, for any browser")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="the table, numbers in full")
@@ -21,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of every episode and write what was asked for."""
     check_outputs([path for path in (arguments.png, arguments.html, arguments.csv) if path], _files(arguments.bags))
+    if arguments.case:
+        load_case(arguments.case)  # from now on its class serves a bag whose plant bears its name
     report = analyze(arguments.bags)
     written = []
     if arguments.png:

@@ -22,6 +22,7 @@ from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
 from tdof_npid_ros.interfaces import message_class
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.wire import SECOND, Sample
 
 CLOCK = "/clock"
@@ -102,8 +103,8 @@ class ReplayNode(LoopNode):
             if info.problem or info.encoding not in CDR_DEFINITIONS:
                 raise ValueError(info.problem or f"it is in {info.encoding}, not CDR")
             return self.create_publisher(message_class(info.type), self._relative(topic), qos)
-        except ValueError as error:
-            self.get_logger().warning(f"{topic} is not replayed: {error}")
+        except Exception as error:  # of ours, or whatever rclpy has against a name that a bag may hold
+            self.get_logger().warning(f"{one_line(topic)} is not replayed: {one_line(error)}")
             return None
 
     def _is_latched(self, topic: str) -> bool:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.plants.linear import TransferFunction
-from tdof_npid_ros.plants.ode import Ode, Sprott, load_class
+from tdof_npid_ros.plants.ode import Ode, Sprott, load_class, loaded_class
 from tdof_npid_ros.plants.plant import Plant, PlantError
 
 OFFSETS = {"output_offset": 0.0, "effort_offset": 0.0}  # a linear model's operating point
@@ -31,21 +33,36 @@ FIXED_WHILE_RUNNING = (
 )
 
 
-def model_parameters(model: str) -> dict[str, float | list[float]]:
-    """The parameters of a model by name, with their defaults.
+def named_model(value: Any, folder: Path | None = None) -> str:
+    """The `model` that the user gives: on the command line, or in a parameter file in a folder. Its class is imported.
 
     Raises:
         PlantError: no such model.
     """
+    model = str(value)
     if ":" in model:
-        description = load_class(model)
+        load_class(model, folder)
+    model_parameters(model)
+    return model
+
+
+def model_parameters(model: str) -> dict[str, float | list[float]]:
+    """The parameters of a model by name, with their defaults.
+
+    Raises:
+        PlantError: no such model, or a class that the user has not named (`named_model`).
+    """
+    if ":" in model:
+        description = loaded_class(model)
         return {
             **{name: float(value) for name, value in description.parameters.items()},
             "initial_state": list(map(float, description.initial_state)),
             "substeps": 1.0,
         }
     if model not in MODELS:
-        raise PlantError(f"model {model!r} is unknown: take one of {', '.join(MODELS)}, or package.module:Class")
+        raise PlantError(
+            f"model {one_line(model, 100)!r} is unknown: take one of {', '.join(MODELS)}, or package.module:Class"
+        )
     return dict(MODELS[model])
 
 
@@ -58,7 +75,7 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     p = {name: _typed(name, values.get(name, default), default) for name, default in model_parameters(model).items()}
     if ":" in model:
         initial_state, substeps = p.pop("initial_state"), p.pop("substeps")
-        return Ode(load_class(model), p, tuple(initial_state), substeps)
+        return Ode(loaded_class(model), p, tuple(initial_state), substeps)
     if model == "sprott":
         return Sprott(p["a"], p["b"], p["c"], tuple(p["initial_state"]))
     offsets = {name: p[name] for name in OFFSETS}

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import copy
 import importlib
+import importlib.machinery
 import inspect
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.plants.kernels import SampledOde, SampledSprott, sprott_derivative
 from tdof_npid_ros.plants.plant import PlantError
 
@@ -165,21 +170,75 @@ def _resting(plant: Ode, wanted: float) -> tuple[State, float]:
     )
 
 
-def load_class(path: str) -> Any:
-    """The class that `model: package.module:Class` names.
+_loaded: dict[str, Any] = {}  # classes by the `model` that the user named
+
+
+def load_class(path: str, folder: Path | None = None) -> Any:
+    """Import the class that `model: package.module:Class` names, for a `model` that the user gave.
+
+    It is looked for where Python looks for modules, and then in a folder. From here on `loaded_class` has it.
+
+    Args:
+        folder: of the parameter file in which the user named it.
 
     Raises:
         PlantError: it cannot be imported or lacks a part of a plant.
     """
     module_name, _, class_name = path.partition(":")
-    try:
-        found: Any = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
+    with _importing_from(folder):
+        try:
+            _check_same_module(path, module_name)
+            found: Any = getattr(importlib.import_module(module_name), class_name)
+        except PlantError:
+            raise
+        except (ImportError, AttributeError, ValueError) as error:
+            raise PlantError(
+                f"model {path!r} cannot be loaded ({error}): is its package installed, on PYTHONPATH, or in the "
+                "parameter file's folder?"
+            ) from error
+        except Exception as error:  # the user's code: whatever goes wrong in it
+            raise PlantError(f"model {path!r} cannot be loaded: {type(error).__name__}: {error}") from error
+    _check_description(path, found)
+    _loaded[path] = found
+    return found
+
+
+def loaded_class(path: str) -> Any:
+    """The class of a `model` that may come from a bag or from another node; it is never imported for that.
+
+    Raises:
+        PlantError: the user has named no such class.
+    """
+    if path not in _loaded:
         raise PlantError(
-            f"model {path!r} cannot be loaded ({error}): is its package installed or on PYTHONPATH?"
-        ) from error
-    except Exception as error:  # the user's code: whatever goes wrong in it
-        raise PlantError(f"model {path!r} cannot be loaded: {type(error).__name__}: {error}") from error
+            f"the plant's model {one_line(path, 100)!r} is not built in, and classes are loaded only if you name them: "
+            "give the parameter file that does (--case FILE)"
+        )
+    return _loaded[path]
+
+
+@contextmanager
+def _importing_from(folder: Path | None) -> Iterator[None]:
+    """Let Python look for modules in a folder too, after all other places."""
+    before = list(sys.path)
+    if folder is not None:
+        sys.path.append(str(folder.resolve()))
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+def _check_same_module(path: str, module_name: str) -> None:
+    """Refuse a module of the same name as one that was loaded from the folder of another parameter file."""
+    root = module_name.partition(".")[0]
+    loaded = getattr(sys.modules.get(root), "__file__", None)
+    wanted = importlib.machinery.PathFinder.find_spec(root) if root and loaded else None
+    if loaded and wanted is not None and wanted.origin and not Path(wanted.origin).samefile(loaded):
+        raise PlantError(f"model {path!r}: another module {root} is loaded already, {loaded}: rename one of them")
+
+
+def _check_description(path: str, found: Any) -> None:
     missing = [name for name in ("parameters", "initial_state", "derivative", "output") if not hasattr(found, name)]
     is_class = inspect.isclass(found)
     if not is_class or missing:
@@ -188,7 +247,6 @@ def load_class(path: str) -> Any:
         raise PlantError(f"{path}.parameters is {found.parameters!r}: it must map names to finite numbers")
     if not isinstance(found.initial_state, (tuple, list)) or not all(map(_is_number, found.initial_state)):
         raise PlantError(f"{path}.initial_state is {found.initial_state!r}: it must be a tuple of finite numbers")
-    return found
 
 
 def _is_number(value: Any) -> bool:

@@ -39,7 +39,22 @@ def test_missing_type_says_which_package_to_install(type_name: str) -> None:
         schema.definition(type_name)
 
 
-@pytest.mark.parametrize("type_name", ["", "JointState", "../../etc/passwd", "a/b/c/d"])
+@pytest.mark.parametrize(
+    "type_name",
+    [
+        "",
+        "JointState",
+        "../../etc/passwd",
+        "a/b/c/d",
+        "/msg/X",
+        "std_msgs/msg/",
+        "std_msgs/msg/String ",
+        "x" * 100_000,
+        "std_msgs/../std_msgs/msg/String",
+        "std__msgs/msg/String",
+        "std_msgs\n/msg/String",
+    ],
+)
 def test_name_that_is_no_type_is_refused(type_name: str) -> None:
     with pytest.raises(BagError, match="no message type"):
         schema.definition(type_name)
@@ -50,6 +65,9 @@ def test_sourced_workspace_comes_first(tmp_path, monkeypatch) -> None:
     folder.mkdir(parents=True)
     (folder / "Pair.msg").write_text("Single first\nSingle second\n")
     (folder / "Single.msg").write_text("float64 value\n")
+    index = tmp_path / "share" / "ament_index" / "resource_index" / "rosidl_interfaces"
+    index.mkdir(parents=True)
+    (index / "my_msgs").write_text("msg/Pair.idl\nmsg/Pair.msg\nmsg/Single.idl\nmsg/Single.msg")
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     text = schema.definition("my_msgs/msg/Pair")
     assert text == f"Single first\nSingle second\n\n{'=' * 80}\nMSG: my_msgs/Single\nfloat64 value\n"

@@ -67,7 +67,9 @@ def reserved_domain() -> tuple[int, IO[str]]:
 class NodeProcess:
     """A node in a process of its own; what it prints is in `log`."""
 
-    def __init__(self, node: str, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+    def __init__(
+        self, node: str, arguments: Sequence[str], environment: dict[str, str], log: Path, cwd: Path = REPOSITORY
+    ) -> None:
         self.node = node
         self._log = log
         self.expected_status: int | None = 0
@@ -77,7 +79,7 @@ class NodeProcess:
                 [sys.executable, "-m", "tdof_npid_ros.graph", node, *arguments],
                 stdout=stream,
                 stderr=subprocess.STDOUT,
-                cwd=REPOSITORY,
+                cwd=cwd,
                 env=environment,
             )
 
@@ -175,13 +177,22 @@ class Graph:
             context.shutdown()
             context.destroy()
 
-    def start(self, node: str, *arguments: str, case: str = "", namespace: str = "", **parameters: Any) -> NodeProcess:
+    def start(
+        self,
+        node: str,
+        *arguments: str,
+        case: str = "",
+        namespace: str = "",
+        cwd: Path = REPOSITORY,
+        **parameters: Any,
+    ) -> NodeProcess:
         """Start a node.
 
         Args:
             arguments: more of its `--ros-args`.
             case: name of a file in config/, or a path, whose parameters it gets.
             namespace: to start it in.
+            cwd: folder to start it in.
             parameters: after those of the case; dots in names as double underscores.
         """
         values = dict(parameters)
@@ -196,7 +207,7 @@ class Graph:
             write_parameters(file, {node: {name.replace("__", "."): plain(value) for name, value in values.items()}})
             command += ["--params-file", str(file)]
         log = self.folder / f"{node}-{len(self.processes)}.log"
-        process = NodeProcess(node, command, self.environment, log)
+        process = NodeProcess(node, command, self.environment, log, cwd)
         self.processes.append(process)
         return process
 

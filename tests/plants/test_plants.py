@@ -13,7 +13,7 @@ from scipy import signal
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.loop import simulate
-from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.catalog import make_plant, model_parameters, named_model
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.scenario import Segment
@@ -111,7 +111,7 @@ def test_a_users_plant_is_integrated_with_fourth_order_accuracy() -> None:
         method="DOP853", rtol=1e-13, atol=1e-14, t_eval=times,
     ).y[0]  # fmt: skip
     errors = [
-        np.max(np.abs(response(make_plant(path, {"substeps": substeps}), np.zeros(10), 0.1) - exact))
+        np.max(np.abs(response(make_plant(named_model(path), {"substeps": substeps}), np.zeros(10), 0.1) - exact))
         for substeps in (1, 2, 4)
     ]
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
@@ -144,7 +144,7 @@ def test_a_users_plant_leaves_nothing_in_the_cache_that_others_cannot_read(tmp_p
 
 
 def test_lanes_of_a_users_plant_are_independent() -> None:
-    simulator = PlantSimulator(make_plant(f"{__name__}:Pendulum", {}), 10_000_000, 3, UNLIMITED)
+    simulator = PlantSimulator(make_plant(named_model(f"{__name__}:Pendulum"), {}), 10_000_000, 3, UNLIMITED)
     for _ in range(50):
         simulator.advance(np.array([0.0, 1.0, 2.0]), np.zeros(3))
     assert len(set(simulator.output)) == 3
@@ -184,7 +184,7 @@ def test_plants_that_cannot_be_built_are_refused_with_the_reason(
     model: str, values: dict[str, object], word: str
 ) -> None:
     with pytest.raises(PlantError, match=word):
-        make_plant(model, values)
+        make_plant(named_model(model), values)
 
 
 USERS_PLANT = """
@@ -211,7 +211,9 @@ def users_plant(name: str, text: str, folder: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_users_plant_has_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plant = make_plant(users_plant("good_tank", USERS_PLANT, tmp_path, monkeypatch), {"area": 4.0, "substeps": 3})
+    plant = make_plant(
+        named_model(users_plant("good_tank", USERS_PLANT, tmp_path, monkeypatch)), {"area": 4.0, "substeps": 3}
+    )
     sampled = plant.sampled(10_000_000)
     assert (sampled.parameters, sampled.substeps) == ((4.0,), 3)
 
@@ -242,15 +244,50 @@ def test_a_users_plant_that_cannot_run_is_refused_with_the_reason(
     assert right in USERS_PLANT
     model = users_plant(f"{name}_tank", USERS_PLANT.replace(right, wrong, 1), tmp_path, monkeypatch)
     with pytest.raises(PlantError, match=words) as caught:
-        make_plant(model, {})
+        make_plant(named_model(model), {})
     assert "\n" not in str(caught.value)
+
+
+def test_a_users_class_lies_on_the_path_or_in_the_folder_of_the_file_that_names_it(tmp_path: Path) -> None:
+    """As in docs/your-own-plant.md: a package beside the parameter file, and a program that is started elsewhere."""
+    (tmp_path / "tanks").mkdir()
+    (tmp_path / "tanks" / "folder_tank.py").write_text(USERS_PLANT)
+    file = tmp_path / "tank.yaml"
+    file.write_text("/**/plant: {ros__parameters: {model: 'tanks.folder_tank:Tank'}}")
+    before = list(sys.path)
+    assert load_case(file).model == "tanks.folder_tank:Tank"
+    assert sys.path == before
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "tank.yaml").write_text("/**/plant: {ros__parameters: {model: 'other_tank:Tank'}}")
+    with pytest.raises(PlantError, match="in the parameter file's folder"):
+        load_case(tmp_path / "other" / "tank.yaml")
+
+
+def test_two_modules_of_one_name_are_not_mistaken_for_each_other(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "twin_tank.py").write_text(USERS_PLANT)
+        (tmp_path / name / "tank.yaml").write_text("/**/plant: {ros__parameters: {model: 'twin_tank:Tank'}}")
+    load_case(tmp_path / "one" / "tank.yaml")
+    load_case(tmp_path / "one" / "tank.yaml")
+    with pytest.raises(PlantError, match="another module twin_tank is loaded already"):
+        load_case(tmp_path / "two" / "tank.yaml")
+
+
+def test_a_class_that_the_user_has_not_named_is_never_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "evil_tank.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')\n{USERS_PLANT}")
+    monkeypatch.syspath_prepend(tmp_path)
+    for use in (make_plant, lambda model, _: model_parameters(model)):
+        with pytest.raises(PlantError, match="--case FILE"):
+            use("evil_tank:Tank", {})
+    assert not (tmp_path / "executed").exists()
 
 
 @pytest.mark.parametrize("substeps", [0, 1.5])
 def test_substeps_are_a_whole_number(substeps: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = users_plant(f"sub_tank_{int(substeps)}", USERS_PLANT, tmp_path, monkeypatch)
     with pytest.raises(PlantError, match="whole number"):
-        make_plant(model, {"substeps": substeps})
+        make_plant(named_model(model), {"substeps": substeps})
 
 
 @pytest.mark.parametrize("dead_time", [0.0, 0.49, 500.0])

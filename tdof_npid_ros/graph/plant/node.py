@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,8 @@ from tdof_npid_ros.graph.plant.realtime import RealtimePlant
 from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd
 from tdof_npid_ros.graph.runtime.messages import lane_names
 from tdof_npid_ros.graph.runtime.node import number, run_node
-from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters
+from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
+from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters, named_model
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.wire import Sample, SignalWriter
@@ -60,13 +64,21 @@ class PlantNode(LoopEnd):
         self.way_of_running = MODES[self.mode](self)
 
     def _declare_model(self) -> None:
-        self.model = str(
-            self.declare_value("model", "first_order", "model of the plant, or package.module:Class", fixed=True)
-        )
+        given = self.declare_value("model", "first_order", "model of the plant, or package.module:Class", fixed=True)
+        self.model = named_model(given, self._folder_of_file_with_model(given))
         self.model_names = list(model_parameters(self.model))
         for name, default in model_parameters(self.model).items():
             fixed = name in FIXED_WHILE_RUNNING
             self.declare_value(name, default, f"parameter {name} of the model {self.model}", fixed=fixed)
+
+    def _folder_of_file_with_model(self, model: Any) -> Path | None:
+        """The folder of the parameter file on the command line that gives the model; None if it is given otherwise."""
+        files = [Path(file) for option, file in pairwise(sys.argv) if option == "--params-file"]
+        for file in reversed(files):
+            with contextlib.suppress(ParameterFileError):  # ROS has read it in its own way
+                if read_parameters(file, self.get_name()).get("model") == model:
+                    return file.parent
+        return None
 
     def _declare_options(self) -> None:
         declare = self.declare_value

@@ -33,6 +33,7 @@ from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
 from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
 from tdof_npid_ros.interfaces import message_class
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.wire import JOINT_STATE
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
@@ -205,9 +206,9 @@ class RecorderNode(LoopNode):
         if tap is None:
             try:
                 tap = self._tap(topic, _recordable(types), _as_reliable_as(offered))
-            except ValueError as error:
+            except Exception as error:  # of ours, or whatever rclpy has against a name that anyone may announce
                 self.not_recorded.add(topic)
-                self.get_logger().warning(f"{topic} is not recorded: {error}")
+                self.get_logger().warning(f"{topic} is not recorded: {one_line(error)}")
                 return
         tap.publishers = max(tap.publishers, len(offered))
 

@@ -28,7 +28,9 @@ from tdof_npid_ros.graph.runtime.ending import end_within
 from tdof_npid_ros.graph.runtime.endpoints import Endpoints, signal_qos
 from tdof_npid_ros.graph.runtime.messages import diagnostics_message
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.own_services import guard_services
 from tdof_npid_ros.graph.runtime.realtime import collect_garbage
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import unknown_parameters
 from tdof_npid_ros.wire import Sample, SignalReader
 
@@ -67,7 +69,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.activation_error: Exception | None = None
         self._why_inactive = "inactive: waits for its activation"
         self.endpoints = Endpoints(self, self.refuse)
-        self._refuse_impossible_transitions()
+        guard_services(self.services, self.refuse)
         self._warned: set[str] = set()
         self.autostart = bool(
             self.declare_value(
@@ -227,8 +229,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
                 self.refuse("refused_parameters", cause, f": {error}")
             else:
                 self.counts["refused_parameters"] += 1
-                self.get_logger().warning(f"{cause}: {error}")
-            return SetParametersResult(successful=False, reason=str(error))
+                self.get_logger().warning(one_line(f"{cause}: {error}"))
+            return SetParametersResult(successful=False, reason=one_line(error))
         self._before = {name: plain(self.get_parameter_or(name).value) for name in changes}
         return SetParametersResult(successful=True)
 
@@ -236,7 +238,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         for name, value in changes.items():
             if name not in self.quiet_parameters:
-                self.get_logger().info(f"{name}: {self._before.get(name)} -> {value}")
+                self.get_logger().info(one_line(f"{name}: {self._before.get(name)} -> {value}"))
         self.changed(changes)
 
     # Reporting
@@ -246,7 +248,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.counts[count] += 1
         if cause not in self._warned:
             self._warned.add(cause)
-            self.get_logger().warning(f"{cause}{detail} (further ones are only counted, as {count!r} in /diagnostics)")
+            self.get_logger().warning(
+                f"{one_line(cause + detail)} (further ones are only counted, as {count!r} in /diagnostics)"
+            )
 
     def publish_diagnostics(self) -> None:
         """Publish the node's state and counts now; it happens once a second anyway."""
@@ -263,21 +267,6 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         collect_garbage()
 
     # Life cycle
-
-    def _refuse_impossible_transitions(self) -> None:
-        """Answer that a transition failed which the present state does not have; rclpy would end the process."""
-        (service,) = (each for each in self.services if each.srv_name.endswith("/change_state"))
-        change_state = service.callback
-
-        def guarded(request: Any, response: Any) -> Any:
-            try:
-                return change_state(request, response)
-            except RuntimeError:
-                self.get_logger().warning(f"transition {request.transition.id} refused: not possible in this state")
-                response.success = False
-                return response
-
-        service.callback = guarded
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
@@ -425,7 +414,7 @@ def _start_errors() -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, RuntimeError) as error:
-        raise StartError(" ".join(str(error).split())) from error
+        raise StartError(one_line(error)) from error
 
 
 def autostart(node: LoopNode) -> None:
@@ -437,7 +426,7 @@ def autostart(node: LoopNode) -> None:
     node.trigger_configure()
     node.trigger_activate()
     if node.activation_error is not None:
-        raise RuntimeError(" ".join(str(node.activation_error).split())) from node.activation_error
+        raise RuntimeError(one_line(node.activation_error)) from node.activation_error
 
 
 def _end(node: LoopNode, status: int) -> None:
