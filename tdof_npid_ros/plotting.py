@@ -1,0 +1,250 @@
+"""One look for all pictures: colours, what a picture shows of a response, and the picture of responses itself.
+
+Matplotlib is imported where something is drawn, so that whoever draws nothing does not wait for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Told apart by colour-blind eyes, with a contrast of at least 3:1 on white and on the pages' dark ground.
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#a67c00", "#9467bd", "#808080")
+DASHES = (
+    "-",
+    (0, (6, 2)),
+    (0, (6, 2, 1.5, 2)),
+    (0, (1.5, 1.5)),
+    (0, (10, 3)),
+    (0, (3, 2)),
+    (0, (8, 2, 1.5, 2, 1.5, 2)),
+)
+WIDTHS = (2.2, 1.9, 1.7, 1.6, 1.5, 1.4, 1.3)  # the first curve shines out from under one that coincides with it
+GUIDE = "#808080"  # setpoint, disturbance, limits: what is given, not what the loop does
+DPI = 130
+WIDTH, HEIGHT = 5.4, 2.9  # inches of one set of axes
+
+AT_REST = 0.01  # of a curve's range: nearer to where it ends, it counts as there
+ROOM = 1.3  # a picture ends this much later than the last curve has come to rest
+LEAST_SHOWN = 0.05  # of the whole time
+KICK = 4.0  # an effort's range is cut where a few first samples alone make it this many times larger
+KICK_SAMPLES = 0.02  # of all samples: how many a kick has at the most
+
+
+class PlottingError(ValueError):
+    """A picture that cannot be written; the message names the file and why."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One run in a picture.
+
+    Attributes:
+        label: in the legend.
+        time: s, (samples,).
+        output, effort: (samples,); NaN where there is none.
+    """
+
+    label: str
+    time: np.ndarray
+    output: np.ndarray
+    effort: np.ndarray
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One episode under several controllers: an output above, an effort below.
+
+    Attributes:
+        title: what the episode is called.
+        curves: the runs.
+        setpoint, disturbance: (samples,) over `time`, what is given; None: nothing to draw.
+        time: s, (samples,).
+        limits: of the effort, drawn where they are finite and near.
+        notes: lines under the title: numbers of the response.
+    """
+
+    title: str
+    curves: Sequence[Curve]
+    time: np.ndarray
+    setpoint: np.ndarray | None = None
+    disturbance: np.ndarray | None = None
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    notes: Sequence[str] = field(default=())
+
+
+def shown_until(panel: Panel) -> float:
+    """The time (s) up to which a panel is worth showing: all has come to rest, and a little more.
+
+    Example:
+        >>> t = np.linspace(0, 100, 1001)
+        >>> rise = 1 - np.exp(-t)
+        >>> shown_until(Panel("", [Curve("", t, rise, rise)], t))
+        6.0
+    """
+    end = float(panel.time[-1])
+    last = float(panel.time[0]) + LEAST_SHOWN * (end - float(panel.time[0]))
+    given = [(panel.time, values) for values in (panel.setpoint, panel.disturbance) if values is not None]
+    for time, values in [*given, *((c.time, v) for c in panel.curves for v in (c.output, c.effort))]:
+        known = values[np.isfinite(values)]
+        if not known.size:
+            continue
+        band = AT_REST * float(np.ptp(known))
+        moving = np.flatnonzero(np.abs(np.nan_to_num(values - known[-1])) > band)
+        if moving.size:
+            last = max(last, float(time[min(moving[-1] + 1, len(time) - 1)]))
+    start = float(panel.time[0])
+    return min(end, float(f"{start + ROOM * (last - start):.2g}") if last < end else end)
+
+
+def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
+    """Least and largest effort to show, and whether a kick of a few samples was cut off.
+
+    A derivative's kick at a step may be a hundred times what follows, which would be a flat line.
+    """
+    shown = [c.effort[(c.time <= until) & np.isfinite(c.effort)] for c in panel.curves]
+    values = np.concatenate(shown) if shown else np.zeros(0)
+    if not values.size:
+        return 0.0, 1.0, False
+    low, high = float(values.min()), float(values.max())
+    usual = [np.quantile(v, (KICK_SAMPLES, 1.0 - KICK_SAMPLES)) for v in shown if v.size]
+    least, most = min(float(q[0]) for q in usual), max(float(q[1]) for q in usual)
+    wide = max(most - least, 1e-300)
+    cut = high - low > KICK * wide
+    if cut:
+        low, high = max(low, least - wide), min(high, most + wide)
+    if panel.disturbance is not None and np.ptp(panel.disturbance):
+        low, high = min(low, float(panel.disturbance.min())), max(high, float(panel.disturbance.max()))
+    margin = 0.06 * ((high - low) or max(abs(high), 1.0))
+    return low - margin, high + margin, cut
+
+
+def new_figure(
+    rows: int, columns: int, width: float = WIDTH, height: float = HEIGHT
+) -> tuple[Figure, list[list[Axes]]]:
+    """An empty picture in the project's look, and its axes, [row][column]."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * columns + 0.6, height * rows + 0.4), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.grid(True, color="#e6e6e6", linewidth=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=9)
+    return figure, axes.tolist()
+
+
+def style(index: int) -> dict[str, Any]:
+    """Colour, dashes and width of the curve of that number."""
+    return {
+        "color": PALETTE[index % len(PALETTE)],
+        "linestyle": DASHES[index % len(DASHES)],
+        "linewidth": WIDTHS[min(index, len(WIDTHS) - 1)],
+    }
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a picture; its kind follows the file's name, PNG by default.
+
+    Raises:
+        PlottingError: the file cannot be written, or there is no such kind of picture.
+    """
+    try:
+        figure.savefig(path, format=path.suffix[1:] or "png")
+    except (OSError, ValueError) as error:
+        raise PlottingError(f"{path} cannot be written: {error}") from None
+
+
+def draw_responses(
+    panels: Sequence[Panel], path: Path, *, unit: str = "", effort_unit: str = "", title: str = ""
+) -> None:
+    """Write the picture of some episodes: outputs above, efforts below, one legend for all.
+
+    Args:
+        panels: one for each column; curves of one number have one colour in all of them.
+        unit, effort_unit: for the axes; empty: not known.
+
+    Raises:
+        PlottingError: the file cannot be written.
+    """
+    figure, axes = new_figure(2, len(panels))
+    for column, panel in enumerate(panels):
+        above, below = axes[0][column], axes[1][column]
+        until = shown_until(panel)
+        _draw_panel(panel, above, below, until)
+        above.set_title(panel.title, fontsize=11, loc="left", fontweight="bold")
+        if panel.notes:
+            above.set_title("\n".join(panel.notes), fontsize=8, loc="right", color="#555555")
+        above.tick_params(labelbottom=False)
+        below.set_xlabel("time (s)")
+        for axis in (above, below):
+            axis.set_xlim(float(panel.time[0]), until)
+    axes[0][0].set_ylabel("output y" + (f" ({unit})" if unit else ""))
+    axes[1][0].set_ylabel("effort u" + (f" ({effort_unit})" if effort_unit else ""))
+    handles: dict[str, Any] = {}
+    for axis in (one for row in axes for one in row):
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=min(len(handles), 5),
+        frameon=False,
+        fontsize=9,
+    )
+    if title:
+        figure.suptitle(title, fontsize=12)
+    save(figure, path)
+
+
+def _draw_panel(panel: Panel, above: Axes, below: Axes, until: float) -> None:
+    guide: dict[str, Any] = {"color": GUIDE, "linewidth": 1.1, "drawstyle": "steps-post", "zorder": 1}
+    if panel.setpoint is not None:
+        above.plot(panel.time, panel.setpoint, label="setpoint r", linestyle=(0, (4, 3)), **guide)
+    notes = []
+    if panel.disturbance is not None and np.ptp(panel.disturbance):
+        below.plot(panel.time, panel.disturbance, label="disturbance d", linestyle=(0, (1, 2)), **guide)
+    elif panel.disturbance is not None and panel.disturbance[0]:
+        notes.append(f"disturbance {panel.disturbance[0]:g} throughout")
+    for number, curve in enumerate(panel.curves):
+        above.plot(curve.time, curve.output, label=curve.label, zorder=3 + number, **style(number))
+        below.plot(
+            curve.time, curve.effort, label=curve.label, drawstyle="steps-post", zorder=3 + number, **style(number)
+        )
+    low, high, cut = effort_range(panel, until)
+    for limit in panel.limits:
+        if np.isfinite(limit) and low - 0.5 * (high - low) <= limit <= high + 0.5 * (high - low):
+            below.axhline(limit, label="effort's limits", color=GUIDE, linewidth=1.0, zorder=1)
+            low, high = min(low, limit - 0.04 * (high - low)), max(high, limit + 0.04 * (high - low))
+    _shade_saturation(panel, below)
+    below.set_ylim(low, high)
+    if cut:
+        most = max((float(np.nanmax(np.abs(c.effort[c.time <= until]))) for c in panel.curves), default=0.0)
+        notes.append(f"kick to {most:.3g}, cut off")
+    below.annotate(
+        "\n".join(notes), (0.99, 0.96), xycoords="axes fraction", ha="right", va="top", fontsize=8, color="#555555"
+    )
+
+
+def _shade_saturation(panel: Panel, axis: Axes) -> None:
+    low, high = panel.limits
+    at_limit = np.zeros(len(panel.time), dtype=bool)
+    for curve in panel.curves:
+        if len(curve.effort) == len(at_limit):
+            at_limit |= (curve.effort <= low) | (curve.effort >= high)
+    if at_limit.any():
+        axis.fill_between(
+            panel.time, 0, 1, where=at_limit.tolist(), transform=axis.get_xaxis_transform(), color=GUIDE, alpha=0.15,
+            linewidth=0, label="at a limit", step="post", zorder=0,
+        )  # fmt: skip
