@@ -3,30 +3,81 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tdof_npid_ros.advice import gravest
-from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.case import Case, find_parameter_file, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains
-from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
+from tdof_npid_ros.loop import Trajectory
+from tdof_npid_ros.output_file import check_outputs
+from tdof_npid_ros.plotting import Curve, Panel, draw_responses
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
     add_gain_arguments(parser)
+    add_output_arguments(parser)
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what can be written of simulated responses."""
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="picture of the responses")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="the responses, a row for each sample of each episode")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of the case's setpoint and disturbance episodes."""
+    check_outputs([path for path in (arguments.plot, arguments.csv) if path], [find_parameter_file(arguments.case)])
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
     report = response_report(case, gains) | advised(case, gains)
+    write_responses(case, {title(gains): gains}, arguments)
     print(json.dumps(report) if arguments.json else _table(report))
     return 0
+
+
+def title(gains: Gains) -> str:
+    """A controller's type as the paper writes it: TDOF-NPID2."""
+    return gains.type.replace("_", "-").upper()
+
+
+def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Namespace) -> None:
+    """Write the picture and the table that the arguments ask for.
+
+    Args:
+        of: gains by what their curves are called.
+    """
+    if not (arguments.plot or arguments.csv):
+        return
+    runs = {name: {label: case.simulate(name, gains) for label, gains in of.items()} for name in case.plans}
+    if arguments.plot:
+        draw_responses([_panel(case, name, curves) for name, curves in runs.items()], arguments.plot, title=case.name)
+    if arguments.csv:
+        with arguments.csv.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow(("episode", "controller", "time", "setpoint", "disturbance", "output", "control_effort"))
+            for name, curves in runs.items():
+                for label, run in curves.items():
+                    columns = (run.time, run.setpoint, run.disturbance, run.output[:, 0], run.control_effort[:, 0])
+                    table.writerows((name, label, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
+
+
+def _panel(case: Case, name: str, runs: Mapping[str, Trajectory]) -> Panel:
+    signals = case.signals[name]
+    curves = [Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0]) for label, run in runs.items()]
+    low, high = (float(case.gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
+    limits = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
+    return Panel(name, curves, signals.time, signals.setpoint, signals.disturbance, limits)
 
 
 def response_report(case: Case, gains: Gains) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli import INTERRUPTED
-from tdof_npid_ros.cli.simulate import advised, response_report
+from tdof_npid_ros.cli.simulate import add_output_arguments, advised, response_report, title, write_responses
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
@@ -26,7 +26,7 @@ from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
-from tdof_npid_ros.tuning.study import Study, TuningResult
+from tdof_npid_ros.tuning.study import Study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")
-    parser.add_argument("--plot", type=Path, metavar="PNG", help="draw how the search converged")
+    add_output_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -74,8 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     report |= advised(problem.case, result.gains)
     if arguments.out:
         write_parameters(arguments.out, {"controller": result.gains.as_dict()})
-    if arguments.plot:
-        _plot(arguments.plot, f"{problem.case.name}, {problem.controller}, {problem.algorithm}", result)
+    write_responses(problem.case, _compared(problem, result.gains), arguments)
     print(json.dumps(report) if arguments.json else _summary(report))
     return 0
 
@@ -113,7 +112,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse outputs that cannot be written before hours are spent on what goes there."""
     if arguments.resume and not arguments.checkpoint:
         raise TuningError("--resume needs --checkpoint FILE: what to go on from")
-    written = [path for path in (arguments.checkpoint, arguments.out, arguments.plot) if path]
+    written = [path for path in (arguments.checkpoint, arguments.out, arguments.plot, arguments.csv) if path]
     check_outputs(written, [find_parameter_file(arguments.case)])
     if arguments.out:
         check_replaceable(arguments.out, "controller", Gains().as_dict())
@@ -171,17 +170,7 @@ def _summary(report: dict[str, Any]) -> str:
     )
 
 
-def _plot(path: Path, title: str, result: TuningResult) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.add_subplot()
-    evaluations = [one.evaluations for one in result.improvements] + [result.evaluations]
-    values = [one.value for one in result.improvements] + [result.objective]
-    axes.step(evaluations, values, where="post")
-    axes.set(xlabel="evaluations", ylabel="best objective (unit·s)", title=title, xscale="log")
-    axes.grid(alpha=0.3, which="both")
-    try:
-        figure.savefig(path, format="png", dpi=150)
-    except OSError as error:
-        raise TuningError(f"{path} cannot be written: {error.strerror}") from error
+def _compared(problem: TuningProblem, tuned: Gains) -> dict[str, Gains]:
+    """What the tuned gains stand beside in a picture: those of the file."""
+    before = problem.case.gains
+    return {f"{title(before)} before": before, f"{title(tuned)} tuned": tuned}
