@@ -51,34 +51,42 @@ class Curve:
         label: in the legend.
         time: s, (samples,).
         output, effort: (samples,); NaN where there is none.
+        setpoint, disturbance: what is given, (samples,); None: nothing to draw.
     """
 
     label: str
     time: np.ndarray
     output: np.ndarray
     effort: np.ndarray
+    setpoint: np.ndarray | None = None
+    disturbance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One episode under several controllers: an output above, an effort below.
+    """One episode under several controllers: outputs above, efforts below.
 
     Attributes:
         title: what the episode is called.
         curves: the runs.
-        setpoint, disturbance: (samples,) over `time`, what is given; None: nothing to draw.
-        time: s, (samples,).
         limits: of the effort, drawn where they are finite and near.
-        notes: lines under the title: numbers of the response.
+        notes: lines beside the title: numbers of the response.
     """
 
     title: str
     curves: Sequence[Curve]
-    time: np.ndarray
-    setpoint: np.ndarray | None = None
-    disturbance: np.ndarray | None = None
     limits: tuple[float, float] = (-np.inf, np.inf)
     notes: Sequence[str] = field(default=())
+
+    @property
+    def begin(self) -> float:
+        """When the first curve begins, s."""
+        return min(float(curve.time[0]) for curve in self.curves)
+
+    @property
+    def end(self) -> float:
+        """When the last curve ends, s."""
+        return max(float(curve.time[-1]) for curve in self.curves)
 
 
 def shown_until(panel: Panel) -> float:
@@ -87,22 +95,20 @@ def shown_until(panel: Panel) -> float:
     Example:
         >>> t = np.linspace(0, 100, 1001)
         >>> rise = 1 - np.exp(-t)
-        >>> shown_until(Panel("", [Curve("", t, rise, rise)], t))
-        6.0
+        >>> shown_until(Panel("", [Curve("", t, rise, rise)]))
+        6.1
     """
-    end = float(panel.time[-1])
-    last = float(panel.time[0]) + LEAST_SHOWN * (end - float(panel.time[0]))
-    given = [(panel.time, values) for values in (panel.setpoint, panel.disturbance) if values is not None]
-    for time, values in [*given, *((c.time, v) for c in panel.curves for v in (c.output, c.effort))]:
-        known = values[np.isfinite(values)]
-        if not known.size:
-            continue
-        band = AT_REST * float(np.ptp(known))
-        moving = np.flatnonzero(np.abs(np.nan_to_num(values - known[-1])) > band)
-        if moving.size:
-            last = max(last, float(time[min(moving[-1] + 1, len(time) - 1)]))
-    start = float(panel.time[0])
-    return min(end, float(f"{start + ROOM * (last - start):.2g}") if last < end else end)
+    begin, end = panel.begin, panel.end
+    last = begin + LEAST_SHOWN * (end - begin)
+    for curve in panel.curves:
+        for values in (curve.setpoint, curve.disturbance, curve.output, curve.effort):
+            known = np.empty(0) if values is None else values[np.isfinite(values)]
+            if values is None or not known.size:
+                continue
+            moving = np.flatnonzero(np.abs(np.nan_to_num(values - known[-1])) > AT_REST * float(np.ptp(known)))
+            if moving.size:
+                last = max(last, float(curve.time[min(moving[-1] + 1, len(curve.time) - 1)]))
+    return min(end, float(f"{begin + ROOM * (last - begin):.2g}")) if last < end else end
 
 
 def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
@@ -111,7 +117,7 @@ def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
     A derivative's kick at a step may be a hundred times what follows, which would be a flat line.
     """
     shown = [c.effort[(c.time <= until) & np.isfinite(c.effort)] for c in panel.curves]
-    values = np.concatenate(shown) if shown else np.zeros(0)
+    values = np.concatenate(shown)
     if not values.size:
         return 0.0, 1.0, False
     low, high = float(values.min()), float(values.max())
@@ -121,8 +127,9 @@ def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
     cut = high - low > KICK * wide
     if cut:
         low, high = max(low, least - wide), min(high, most + wide)
-    if panel.disturbance is not None and np.ptp(panel.disturbance):
-        low, high = min(low, float(panel.disturbance.min())), max(high, float(panel.disturbance.max()))
+    for curve in panel.curves:
+        if curve.disturbance is not None and np.ptp(curve.disturbance):
+            low, high = min(low, float(curve.disturbance.min())), max(high, float(curve.disturbance.max()))
     margin = 0.06 * ((high - low) or max(abs(high), 1.0))
     return low - margin, high + margin, cut
 
@@ -188,7 +195,7 @@ def draw_responses(
         above.tick_params(labelbottom=False)
         below.set_xlabel("time (s)")
         for axis in (above, below):
-            axis.set_xlim(float(panel.time[0]), until)
+            axis.set_xlim(panel.begin, until)
     axes[0][0].set_ylabel("output y" + (f" ({unit})" if unit else ""))
     axes[1][0].set_ylabel("effort u" + (f" ({effort_unit})" if effort_unit else ""))
     handles: dict[str, Any] = {}
@@ -209,19 +216,11 @@ def draw_responses(
 
 
 def _draw_panel(panel: Panel, above: Axes, below: Axes, until: float) -> None:
-    guide: dict[str, Any] = {"color": GUIDE, "linewidth": 1.1, "drawstyle": "steps-post", "zorder": 1}
-    if panel.setpoint is not None:
-        above.plot(panel.time, panel.setpoint, label="setpoint r", linestyle=(0, (4, 3)), **guide)
-    notes = []
-    if panel.disturbance is not None and np.ptp(panel.disturbance):
-        below.plot(panel.time, panel.disturbance, label="disturbance d", linestyle=(0, (1, 2)), **guide)
-    elif panel.disturbance is not None and panel.disturbance[0]:
-        notes.append(f"disturbance {panel.disturbance[0]:g} throughout")
+    notes = _draw_given(panel, above, below)
     for number, curve in enumerate(panel.curves):
-        above.plot(curve.time, curve.output, label=curve.label, zorder=3 + number, **style(number))
-        below.plot(
-            curve.time, curve.effort, label=curve.label, drawstyle="steps-post", zorder=3 + number, **style(number)
-        )
+        look = {**style(number), "label": curve.label, "zorder": 3 + number}
+        above.plot(curve.time, curve.output, **look)
+        below.plot(curve.time, curve.effort, drawstyle="steps-post", **look)
     low, high, cut = effort_range(panel, until)
     for limit in panel.limits:
         if np.isfinite(limit) and low - 0.5 * (high - low) <= limit <= high + 0.5 * (high - low):
@@ -230,21 +229,39 @@ def _draw_panel(panel: Panel, above: Axes, below: Axes, until: float) -> None:
     _shade_saturation(panel, below)
     below.set_ylim(low, high)
     if cut:
-        most = max((float(np.nanmax(np.abs(c.effort[c.time <= until]))) for c in panel.curves), default=0.0)
+        most = max(float(np.nanmax(np.abs(c.effort[c.time <= until]), initial=0.0)) for c in panel.curves)
         notes.append(f"kick to {most:.3g}, cut off")
     below.annotate(
         "\n".join(notes), (0.99, 0.96), xycoords="axes fraction", ha="right", va="top", fontsize=8, color="#555555"
     )
 
 
+def _draw_given(panel: Panel, above: Axes, below: Axes) -> list[str]:
+    """Setpoints and disturbances, each once; a disturbance that never changes is told, not drawn."""
+    guide: dict[str, Any] = {"color": GUIDE, "linewidth": 1.1, "drawstyle": "steps-post", "zorder": 1}
+    notes: list[str] = []
+    drawn: set[bytes] = set()
+    for curve in panel.curves:
+        r, d = curve.setpoint, curve.disturbance
+        if r is not None and not np.isnan(r).all() and (content := r.tobytes()) not in drawn:
+            drawn.add(content)
+            above.plot(curve.time, r, label="setpoint r", linestyle=(0, (4, 3)), **guide)
+        if d is None or not np.any(d) or (content := b"d" + d.tobytes()) in drawn:
+            continue
+        drawn.add(content)
+        if np.ptp(d):
+            below.plot(curve.time, d, label="disturbance d", linestyle=(0, (1, 2)), **guide)
+        else:
+            notes.append(f"disturbance {d[0]:g} throughout")
+    return notes
+
+
 def _shade_saturation(panel: Panel, axis: Axes) -> None:
     low, high = panel.limits
-    at_limit = np.zeros(len(panel.time), dtype=bool)
     for curve in panel.curves:
-        if len(curve.effort) == len(at_limit):
-            at_limit |= (curve.effort <= low) | (curve.effort >= high)
-    if at_limit.any():
-        axis.fill_between(
-            panel.time, 0, 1, where=at_limit.tolist(), transform=axis.get_xaxis_transform(), color=GUIDE, alpha=0.15,
-            linewidth=0, label="at a limit", step="post", zorder=0,
-        )  # fmt: skip
+        at_limit = (curve.effort <= low) | (curve.effort >= high)
+        if at_limit.any():
+            axis.fill_between(
+                curve.time, 0, 1, where=at_limit.tolist(), transform=axis.get_xaxis_transform(), color=GUIDE,
+                alpha=0.15, linewidth=0, label="at a limit", step="post", zorder=0,
+            )  # fmt: skip

@@ -31,7 +31,7 @@ TIME = np.linspace(0.0, 100.0, 10_001)
 
 
 def panel(output: np.ndarray, effort: np.ndarray) -> Panel:
-    return Panel("step", [Curve("PID", TIME, output, effort)], TIME, np.ones_like(TIME))
+    return Panel("step", [Curve("PID", TIME, output, effort, np.ones_like(TIME))])
 
 
 def test_a_flat_tail_is_not_shown() -> None:

@@ -73,11 +73,13 @@ def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Nam
 
 
 def _panel(case: Case, name: str, runs: Mapping[str, Trajectory]) -> Panel:
-    signals = case.signals[name]
-    curves = [Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0]) for label, run in runs.items()]
+    curves = [
+        Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance)
+        for label, run in runs.items()
+    ]
     low, high = (float(case.gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
     limits = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
-    return Panel(name, curves, signals.time, signals.setpoint, signals.disturbance, limits)
+    return Panel(name, curves, limits)
 
 
 def response_report(case: Case, gains: Gains) -> dict[str, Any]:

@@ -11,17 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES
+from tdof_npid_ros.plotting import GUIDE, PALETTE, new_figure
 from tdof_npid_ros.tuning.pareto import Front
 
 STYLE: dict[str, dict[str, Any]] = {
-    "pid": {"color": "#2f5d8a", "linestyle": "-", "marker": "o"},
-    "npid": {"color": "#8a5fb0", "linestyle": ":", "marker": "s"},
-    "tdof_npid1": {"color": "#e07b1f", "linestyle": "--", "marker": "^"},
-    "tdof_npid2": {"color": "#2a9a68", "linestyle": "-.", "marker": "v"},
+    "pid": {"color": PALETTE[0], "linestyle": "-", "marker": "o"},
+    "npid": {"color": PALETTE[3], "linestyle": ":", "marker": "s"},
+    "tdof_npid1": {"color": PALETTE[1], "linestyle": "--", "marker": "^"},
+    "tdof_npid2": {"color": PALETTE[2], "linestyle": "-.", "marker": "v"},
 }
-REFERENCE: dict[str, Any] = {"color": "#999999", "linewidth": 0.8, "zorder": 0}
+REFERENCE: dict[str, Any] = {"color": GUIDE, "linewidth": 0.8, "zorder": 0}
 WIDTH = 10.0  # inches
-DPI = 120
 TITLE_SIZE = 10  # points
 POINTS = 2000  # of a curve, about: more than its axes have pixels
 
@@ -64,8 +64,8 @@ def draw_error_scaling(error: np.ndarray, scaled: Mapping[float, np.ndarray], pa
     """Figure 1: ζ over e for several σ, each of shape (errors,)."""
     canvas, axes = _canvas(1, 1, 4.0, width=6.5)
     ax = axes[0][0]
-    ax.plot(error, error, color="#999999", linewidth=0.8, label="ζ = e (linear)")
-    for (sigma, value), color in zip(scaled.items(), ("#2f5d8a", "#e07b1f", "#2a9a68"), strict=True):
+    ax.plot(error, error, color=GUIDE, linewidth=0.8, label="ζ = e (linear)")
+    for (sigma, value), color in zip(scaled.items(), PALETTE[:3], strict=True):
         ax.plot(error, value, color=color, label=f"σ = {sigma:g}")
     ax.set(xlabel="error e", ylabel="scaled error ζ", ylim=(-2.5, 2.5), xlim=(error[0], error[-1]))
     ax.legend(frameon=False)
@@ -90,12 +90,12 @@ def draw_chaos(time: np.ndarray, x1: np.ndarray, x2: np.ndarray, path: Path) -> 
     """Figure 13: the phase portrait and the output of the circuit left alone."""
     canvas, axes = _canvas(1, 2, 3.8)
     portrait, series = axes[0]
-    portrait.plot(x1, x2, color="#2f5d8a", linewidth=0.5)
-    portrait.plot(x1[0], x2[0], "o", color="#c0392b", markersize=5, label="start")
+    portrait.plot(x1, x2, color=PALETTE[0], linewidth=0.5)
+    portrait.plot(x1[0], x2[0], "o", color=PALETTE[1], markersize=5, label="start")
     portrait.set(xlabel="x₁", ylabel="x₂")
     portrait.set_title("(a) phase portrait", fontsize=TITLE_SIZE)
     portrait.legend(frameon=False)
-    series.plot(time, x1, color="#2f5d8a", linewidth=0.8)
+    series.plot(time, x1, color=PALETTE[0], linewidth=0.8)
     series.set_title("(b) output", fontsize=TITLE_SIZE)
     series.set(xlabel="time (s)", ylabel="y = x₁", xlim=(time[0], time[-1]))
     canvas.savefig(path)
@@ -115,9 +115,4 @@ def _draw_panel(panel: Panel, ax: Axes) -> None:
 
 
 def _canvas(rows: int, columns: int, height: float, width: float = WIDTH) -> tuple[Canvas, list[list[Axes]]]:
-    canvas = Canvas(figsize=(width, height * rows), dpi=DPI, layout="constrained")
-    axes = canvas.subplots(rows, columns, squeeze=False)
-    for ax in axes.flat:
-        ax.grid(True, color="#e6e6e6", linewidth=0.6)
-        ax.spines[["top", "right"]].set_visible(False)
-    return canvas, axes.tolist()
+    return new_figure(rows, columns, width / columns, height)
