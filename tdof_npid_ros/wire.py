@@ -1,5 +1,5 @@
 """The loop's signals as they are on the wire: sensor_msgs/msg/JointState in CDR, read and written without rclpy's
-message.
+message; and the labels that they bear in `header.frame_id`.
 
 To build that message, and to take it apart, costs rclpy more than a step of the loop costs plant and controller
 together.
@@ -8,9 +8,11 @@ What turns at every step goes this way; everything else publishes ordinary messa
 
 from __future__ import annotations
 
+import re
 import struct
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,6 +22,83 @@ SECOND: Final = 1_000_000_000  # ns
 _STAMP: Final = 4  # where header.stamp is; places are aligned as counted from here
 _LABELS: Final = 12  # where header.frame_id is, and name after it
 NO_VALUES = np.empty(0)
+
+
+NO_PLAN: Final = "-"  # in a label, in place of a plan's digest
+_LABEL: Final = re.compile(r"(?:([0-9a-f]{12})|-)/([0-9a-z]+)\.([0-9]{1,18})")
+_OLD_LABEL: Final = re.compile(r"([0-9a-f]{12})/([0-9]{1,18})")  # <plan>/<number>, in recordings of before 2027
+_REMEMBERED: Final = 256  # labels that need not be parsed again; at any time a loop has two
+
+
+class EpisodeLabel(NamedTuple):
+    """Which episode an output of our plant belongs to: `<plan, or ->/<activation>.<number>` in `header.frame_id`.
+
+    A label that is new says that the plant has begun from its initial state.
+
+    Attributes:
+        plan: digest of the plan that the plant follows in lockstep; empty where setpoint and disturbance are live.
+        activation: of the plant, another one each time; empty in labels of the old form, `<plan>/<number>`.
+        number: counts the episodes and resets of the activation, from 1.
+    """
+
+    plan: str
+    activation: str
+    number: int
+
+    @staticmethod
+    def parse(text: str) -> EpisodeLabel | None:
+        """The label that a text is; None if it is anything else, a robot's frame for one."""
+        return _parsed_label(text)
+
+    @staticmethod
+    def named_in(frame_id: str) -> EpisodeLabel | None:
+        """The episode that an output's or an answer's `header.frame_id` names."""
+        return _parsed_label(frame_id) or _parsed_answer(frame_id).episode
+
+    def __str__(self) -> str:
+        if not self.activation:
+            return f"{self.plan}/{self.number}"
+        return f"{self.plan or NO_PLAN}/{self.activation}.{self.number}"
+
+    def follows(self, other: EpisodeLabel) -> bool:
+        """Whether this is a later episode of the same activation."""
+        return self.activation == other.activation and self.number > other.number
+
+
+class AnswerLabel(NamedTuple):
+    """What an answer was computed with and for: `<parameters>`, or `<parameters> <episode>`, in `header.frame_id`.
+
+    Attributes:
+        parameters: their digest.
+        episode: of the output that is answered; None for a robot's.
+    """
+
+    parameters: str
+    episode: EpisodeLabel | None = None
+
+    @staticmethod
+    def parse(text: str) -> AnswerLabel:
+        """The label that an answer's `header.frame_id` is."""
+        return _parsed_answer(text)
+
+    def __str__(self) -> str:
+        return self.parameters if self.episode is None else f"{self.parameters} {self.episode}"
+
+
+@lru_cache(_REMEMBERED)
+def _parsed_label(text: str) -> EpisodeLabel | None:
+    if found := _LABEL.fullmatch(text):
+        plan, activation, number = found.groups()
+        return EpisodeLabel(plan or "", activation, int(number))
+    if found := _OLD_LABEL.fullmatch(text):
+        return EpisodeLabel(found[1], "", int(found[2]))
+    return None
+
+
+@lru_cache(_REMEMBERED)
+def _parsed_answer(text: str) -> AnswerLabel:
+    parameters, _, episode = text.partition(" ")
+    return AnswerLabel(parameters, _parsed_label(episode))
 
 
 class _Order(NamedTuple):

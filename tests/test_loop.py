@@ -1,4 +1,5 @@
-"""There is one closed loop: stepped, run alone or run in blocks of lanes, it gives the same bits (E1)."""
+"""There is one closed loop: stepped, run alone or run in blocks of lanes, it gives the same bits (distributed =
+local)."""
 
 import dataclasses
 import math
@@ -15,6 +16,7 @@ from tdof_npid_ros.paper.tables import CASES
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.scenario import parse_plan
+from tdof_npid_ros.wire import EpisodeLabel
 
 UNLIMITED = (-math.inf, math.inf)
 STEPS = 700
@@ -33,7 +35,7 @@ def shortened(case: Case) -> Case:
 def stepped(case: Case, episode: str, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
     """The episode as the nodes run it: plant and controller apart, one step at a time."""
     simulator = PlantSimulator(case.plant, case.sample_period_ns, gains.lanes, case.effort_limits)
-    run = Episode(case.plans[episode], simulator, case.plant_at, 1)
+    run = Episode(case.plans[episode], simulator, case.plant_at, EpisodeLabel(case.plans[episode].digest, "a", 1))
     controller = Controller(gains, case.sample_period_ns)
     outputs, efforts, running = [], [], True
     while running:

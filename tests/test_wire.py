@@ -1,4 +1,4 @@
-"""Signals on the wire against rosbags' CDR, both ways; what is no JointState is refused."""
+"""Signals on the wire against rosbags' CDR, both ways; what is no JointState is refused; labels, both ways."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tdof_npid_ros.wire import JOINT_STATE, NO_VALUES, SECOND, Sample, SignalReader, SignalWriter
+from tdof_npid_ros.wire import (
+    JOINT_STATE,
+    NO_VALUES,
+    SECOND,
+    AnswerLabel,
+    EpisodeLabel,
+    Sample,
+    SignalReader,
+    SignalWriter,
+)
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)
@@ -102,3 +111,40 @@ def test_values_are_the_signals_own() -> None:
     assert sample.position is NO_VALUES
     sample.effort[0] = 3.0  # a node may keep and change it
     assert sample.effort.flags.aligned
+
+
+@pytest.mark.parametrize(
+    ("text", "label"),
+    [
+        ("0123456789ab/c0ffee11.3", EpisodeLabel("0123456789ab", "c0ffee11", 3)),
+        ("-/c0ffee11.12", EpisodeLabel("", "c0ffee11", 12)),
+        ("0123456789ab/7", EpisodeLabel("0123456789ab", "", 7)),  # of the old form
+    ],
+)
+def test_a_label_is_what_it_is_written_as(text: str, label: EpisodeLabel) -> None:
+    assert EpisodeLabel.parse(text) == label
+    assert str(label) == text
+    answer = AnswerLabel("deadbeef0123", label)
+    assert AnswerLabel.parse(str(answer)) == answer
+    assert EpisodeLabel.named_in(text) == EpisodeLabel.named_in(str(answer)) == label
+
+
+@pytest.mark.parametrize(
+    "frame",
+    ["", "base_link", "robot1/base_link", "-/x", "-/.1", "-/3", "0123456789ab/", "0123/a.1", "a b/c.1"],
+)
+def test_any_other_frame_is_no_label(frame: str) -> None:
+    assert EpisodeLabel.parse(frame) is None
+    assert EpisodeLabel.named_in(frame) is None
+    assert AnswerLabel.parse(frame).episode is None
+
+
+def test_an_answer_to_a_robot_bears_its_parameters_alone() -> None:
+    assert str(AnswerLabel("deadbeef0123")) == "deadbeef0123"
+    assert AnswerLabel.parse("deadbeef0123") == AnswerLabel("deadbeef0123", None)
+
+
+def test_later_episodes_are_those_of_the_same_activation() -> None:
+    first, second, other = (EpisodeLabel("", *of) for of in (("a", 1), ("a", 2), ("b", 9)))
+    assert second.follows(first)
+    assert not (first.follows(second) or first.follows(first) or other.follows(first))

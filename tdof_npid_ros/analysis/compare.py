@@ -11,10 +11,9 @@ import numpy as np
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.scenario import episode_named
-from tdof_npid_ros.wire import SignalReader
+from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel, SignalReader
 
-Key = tuple[str, int]  # episode and stamp in ns
+Key = tuple[EpisodeLabel | None, int]  # episode and stamp in ns
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Recorded:
             sample = SignalReader().read(output)
         except ValueError:
             return None  # nobody could read it
-        key = episode_named(sample.frame_id), sample.stamp_ns
+        key = EpisodeLabel.parse(sample.frame_id), sample.stamp_ns
         return key if key in self.answers else None
 
 
@@ -135,6 +134,6 @@ def _answers(loop: Loop) -> dict[Key, tuple[str, np.ndarray]]:
     assert signal is not None
     found: dict[Key, tuple[str, np.ndarray]] = {}
     for frame, stamp, effort in zip(signal.frame_id.tolist(), signal.stamp_ns.tolist(), signal.effort, strict=True):
-        digest, _, episode = frame.partition(" ")
+        digest, episode = AnswerLabel.parse(frame)
         found[episode, stamp] = digest, np.asarray(effort, dtype=np.float64)
     return found

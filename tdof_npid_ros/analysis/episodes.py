@@ -15,8 +15,9 @@ from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.stamps import RESTART_NS
-from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, episode_named, parse_plan
+from tdof_npid_ros.control.session import FAR_NS
+from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, parse_plan
+from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
 LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
@@ -97,17 +98,17 @@ def bag_names(bags: Iterable[str]) -> dict[str, str]:
 def _episodes(loop: Loop) -> Iterator[Episode]:
     names = _plan_names(loop.scenario, loop.plans)
     answers = loop.control_effort
-    by_episode: dict[str, list[slice]] = defaultdict(list)
+    by_episode: dict[EpisodeLabel | None, list[slice]] = defaultdict(list)
     for stretch in _stretches(answers) if answers is not None else []:
         by_episode[_episode_of(answers, stretch)].append(stretch)  # type: ignore[arg-type]
     known = configurations(loop.histories)
     for count, stretch in enumerate(_stretches(loop.output), start=1):
-        name = _episode_of(loop.output, stretch)
-        if name:
-            mine = by_episode[name].pop(0) if by_episode[name] else slice(0, 0)
+        label = _episode_of(loop.output, stretch)
+        if label is not None:
+            mine = by_episode[label].pop(0) if by_episode[label] else slice(0, 0)
         else:
             mine = _published_during(loop.output, stretch, answers)
-        episode = _episode(loop, stretch, name, count, answers, mine, known, names)
+        episode = _episode(loop, stretch, label, count, answers, mine, known, names)
         if episode is not None:
             yield episode
 
@@ -118,12 +119,12 @@ def _stretches(signal: Signal) -> list[slice]:
     if not len(signal):
         return []
     stamps = signal.stamp_ns
-    back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > RESTART_NS))
+    back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > FAR_NS))
     starts = {0, *(np.flatnonzero(back) + 1).tolist()}
     steps = np.diff(stamps)
     gap_ns = max(LONGEST_GAP_NS, LONGEST_GAP_PERIODS * int(np.median(steps))) if len(steps) else LONGEST_GAP_NS
     ahead = (np.flatnonzero(steps > gap_ns) + 1).tolist()
-    starts |= {first for first in ahead if not _episode_of(signal, slice(first, first + 1))}
+    starts |= {first for first in ahead if _episode_of(signal, slice(first, first + 1)) is None}
     runs = signal.runs()
     for before, run in zip(runs, runs[1:], strict=False):
         if _episode_of(signal, before) != _episode_of(signal, run):
@@ -132,9 +133,9 @@ def _stretches(signal: Signal) -> list[slice]:
     return [slice(a, b) for a, b in zip(ordered, ordered[1:], strict=False)]
 
 
-def _episode_of(signal: Signal, stretch: slice) -> str:
-    """What a frame_id says of the episode, after the digest of the parameters that an answer has before it."""
-    return episode_named(str(signal.frame_id[stretch.start]).rpartition(" ")[2])
+def _episode_of(signal: Signal, stretch: slice) -> EpisodeLabel | None:
+    """The episode that an output or an answer names."""
+    return EpisodeLabel.named_in(str(signal.frame_id[stretch.start]))
 
 
 def _published_during(output: Signal, stretch: slice, answers: Signal | None) -> slice:
@@ -149,7 +150,7 @@ def _published_during(output: Signal, stretch: slice, answers: Signal | None) ->
 def _episode(
     loop: Loop,
     stretch: slice,
-    frame: str,
+    label: EpisodeLabel | None,
     count: int,
     answers: Signal | None,
     mine: slice,
@@ -163,10 +164,10 @@ def _episode(
     if not rows.shape[1]:
         return None
     period_ns = int(np.median(np.diff(stamps)))
-    digest, _, number = frame.partition("/")
+    digest = label.plan if label is not None else ""
     plan = loop.plans.get(digest)
     grid = _grid(stamps, period_ns, plan, loop.bag)
-    hold = not frame
+    hold = not digest
     output = _on_grid(grid, stamps, rows, hold)
     setpoint, effort = np.full((2, *output.shape), np.nan)
     digests: list[str] = []
@@ -176,7 +177,7 @@ def _episode(
         effort = _on_grid(grid, effort_stamps, _widened(effort_rows, output), hold)
         setpoint = _on_grid(grid, effort_stamps, _widened(setpoint_rows, output), hold)
         changes = np.flatnonzero(answers.frame_id[mine][1:] != answers.frame_id[mine][:-1]) + 1
-        digests = [str(answers.frame_id[mine][i]).partition(" ")[0] for i in (0, *changes)]
+        digests = [AnswerLabel.parse(str(answers.frame_id[mine][i])).parameters for i in (0, *changes)]
     used = [known[name] for name in digests] if set(digests) <= known.keys() else []
     start_ns = int(loop.output.publish_ns[stretch.start])
     if plan is not None:
@@ -193,7 +194,7 @@ def _episode(
         bag=loop.bag,
         namespace=loop.namespace,
         name=names.get(digest, digest) or UNPLANNED,
-        number=int(number) if number.isdigit() else count,
+        number=label.number if label is not None and digest else count,
         plan=plan,
         sample_period_ns=period_ns,
         start_ns=start_ns,

@@ -1,9 +1,9 @@
-"""E2: every control effort of a bag, computed again from what the controller was given, is the recorded one, bit for
-bit.
+"""replayed = recorded: every control effort of a bag, computed again from what the controller was given, is the
+recorded one, bit for bit.
 
 The answers are taken in the controller's order, each with the output that it names by stamp and episode, the
-setpoint that it bears, and the parameters whose digest it bears. They go through the same `Stamps` and `Controller`
-as in the controller node.
+setpoint that it bears, and the parameters whose digest it bears. They go through the same `Session` as in the
+controller node.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from tdof_npid_ros.analysis.parameters import Configuration, configurations
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.control.stamps import Stamps, Verdict, begins_from_nothing
-from tdof_npid_ros.scenario import Plan, episode_named
+from tdof_npid_ros.control.session import Judgement, Place, Session, is_at_beginning
+from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 # Why an answer cannot be verified.
 NO_PARAMETERS = "the parameters that they bear the digest of are not in the bag"
@@ -122,7 +123,7 @@ class _Answer(NamedTuple):
     step: int
     stamp_ns: int
     digest: str
-    episode: str
+    episode: EpisodeLabel | None
     output: int
     new_publisher: bool  # the controller was activated before this answer
     follows: bool  # no answer is missing between this one and the one before
@@ -138,8 +139,7 @@ class _Replay:
         self._account = account
         self._topic = f"{loop.namespace}control_effort"
         self._configurations = configurations(loop.histories)
-        self._controller: Controller | None = None
-        self._stamps = Stamps()
+        self._session: Session | None = None
         self._known = False  # whether the controller's state is that of the recorded one
 
     def run(self) -> None:
@@ -160,13 +160,20 @@ class _Replay:
         return np.array([field[there.index(name)] for name in wanted])
 
     def _take(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray, u: np.ndarray) -> None:
-        reason = self._prepare(answer, y, r)
+        place = Place(answer.episode, answer.stamp_ns)
+        configuration = self._configurations.get(answer.digest)
+        reason = self._obstacle(configuration, y, r)
+        self._known = self._known and answer.follows
+        if self._session is not None and answer.new_publisher:
+            self._session.begin()
         if reason is not None:
+            self._known = False
             self._account.unverifiable[reason] += 1
+            if self._session is not None:
+                self._session.pass_over(place)
             return
-        assert self._controller is not None and y is not None
-        self._controller.answer(answer.stamp_ns, r, y)
-        expected = self._controller.effort
+        assert configuration is not None and y is not None
+        expected = self._answer_again(self._session_with(configuration), answer, place, y, r)
         if not self._known:
             self._account.unverifiable[UNKNOWN_STATE] += 1
         elif expected.tobytes() != u.tobytes():
@@ -175,25 +182,6 @@ class _Replay:
             self._differs("setpoint", answer, y, r, r, planned)
         else:
             self._account.equal += 1
-
-    def _prepare(self, answer: _Answer, y: np.ndarray | None, r: np.ndarray) -> str | None:
-        """Bring the controller to where the recorded one was before this answer, or say why that cannot be."""
-        if answer.new_publisher:
-            self._stamps.forget()
-        verdict = self._stamps.take(answer.stamp_ns, answer.episode)
-        if verdict == "late":  # it was answered: after late ones, which were not, the clock counts as set back
-            self._stamps.forget()
-            verdict = self._stamps.take(answer.stamp_ns, answer.episode)
-        self._known = self._known and answer.follows
-        configuration = self._configurations.get(answer.digest)
-        reason = self._obstacle(configuration, y, r)
-        if reason is not None:
-            self._known = False
-            return reason
-        assert configuration is not None
-        self._configure(configuration)
-        self._begin(answer, verdict)
-        return None
 
     @staticmethod
     def _obstacle(configuration: Configuration | None, y: np.ndarray | None, r: np.ndarray) -> str | None:
@@ -204,32 +192,44 @@ class _Replay:
         lanes = configuration.gains.lanes
         return OTHER_LANES if len(y) != lanes or len(r) != lanes else None
 
-    def _configure(self, configuration: Configuration) -> None:
+    def _session_with(self, configuration: Configuration) -> Session:
+        """The session, its controller with these parameters."""
         gains, options, period_ns = configuration
-        if self._controller is None or self._controller.sample_period_ns != period_ns:
-            self._controller = Controller(gains, period_ns, options)
-        elif (self._controller.gains, self._controller.options) != (gains, options):
-            self._controller.change(gains, options)
+        session = self._session
+        if session is None:
+            session = self._session = Session(Controller(gains, period_ns, options), Joints(()))
+        elif session.controller.sample_period_ns != period_ns:
+            session.controller = Controller(gains, period_ns, options)
+        elif (session.controller.gains, session.controller.options) != (gains, options):
+            session.controller.change(gains, options)
+        return session
 
-    def _begin(self, answer: _Answer, verdict: Verdict) -> None:
-        """As the controller node does: from nothing, or within a running loop with the integral action it tells."""
-        assert self._controller is not None
-        integral = self._answers.velocity[answer.step]
-        if verdict != "same" and len(integral) == self._controller.lanes:
-            applied = self._picked(answer, self._loop.output.effort[answer.output])
-            if len(applied) != self._controller.lanes or not np.isfinite(applied).all():
-                applied = self._controller.effort
-            self._controller.begin_within(applied.copy(), integral)
-            self._known = True
-        elif verdict == "restart":
-            self._controller.reset()
-            from_nothing = begins_from_nothing(answer.stamp_ns, answer.episode)
-            self._known = from_nothing or answer.new_publisher or (answer.step > 0 and answer.follows)
+    def _answer_again(
+        self, session: Session, answer: _Answer, place: Place, y: np.ndarray, r: np.ndarray
+    ) -> np.ndarray:
+        """The answer as the controller's session gives it; notes whether its state is that of the recorded one."""
+        lanes = session.controller.lanes
+        told = self._answers.velocity[answer.step]
+        applied = self._picked(answer, self._loop.output.effort[answer.output])
+        reported = applied.copy() if len(applied) == lanes and np.isfinite(applied).all() else None
+        if answer.episode is not None and answer.episode.plan in self._loop.plans:
+            session.plan = self._loop.plans[answer.episode.plan]
+        judgement = session.retake(place, r, y, reported, told if len(told) == lanes else None)
+        self._known = self._known or self._begins(judgement, answer, place)
+        assert session.answer is not None
+        return session.answer.effort
+
+    @staticmethod
+    def _begins(judgement: Judgement, answer: _Answer, place: Place) -> bool:
+        """Whether the controller's state is known from here on, whatever it was before."""
+        if judgement.decision == "start":
+            return is_at_beginning(place) or answer.new_publisher or (answer.step > 0 and answer.follows)
+        return judgement.decision == "join"
 
     def _planned(self, answer: _Answer, lanes: int) -> np.ndarray | None:
         """The plan's setpoint, (lanes,); None where there is no plan."""
-        plan: Plan | None = self._loop.plans.get(answer.episode.partition("/")[0])
-        if plan is None or "/" not in answer.episode:
+        plan = self._loop.plans.get(answer.episode.plan) if answer.episode is not None else None
+        if plan is None:
             return None
         return np.full(lanes, plan.value_at("setpoint", answer.stamp_ns))
 
@@ -239,16 +239,17 @@ class _Replay:
         self._account.different += 1
         if self._account.first is not None:
             return
-        assert self._controller is not None
+        assert self._session is not None
+        controller = self._session.controller
         inputs: dict[str, Any] = {"setpoint": _numbers(r), "output": _numbers(y), "parameters": answer.digest}
-        inputs |= self._controller.gains.as_dict() | self._controller.options.as_dict()
-        inputs |= {term: _numbers(row) for term, row in zip(TERMS, self._controller.terms, strict=True)}
+        inputs |= controller.gains.as_dict() | controller.options.as_dict()
+        inputs |= {term: _numbers(row) for term, row in zip(TERMS, controller.terms, strict=True)}
         self._account.first = Difference(
             what,
             self._topic,
             answer.step,
             answer.stamp_ns,
-            answer.episode,
+            str(answer.episode or ""),
             inputs,
             tuple(recorded.tolist()),
             tuple(expected.tolist()),
@@ -260,24 +261,24 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
     answers = loop.control_effort
     assert answers is not None
     outputs = loop.output
-    places: dict[tuple[str, int], list[int]] = defaultdict(list)  # of the outputs, latest first
+    places: dict[Place, list[int]] = defaultdict(list)  # of the outputs, latest first
     for run in reversed(outputs.runs()):
-        episode = episode_named(str(outputs.frame_id[run.start]))
+        episode = EpisodeLabel.parse(str(outputs.frame_id[run.start]))
         for i in reversed(range(run.start, run.stop)):
-            places[episode, int(outputs.stamp_ns[i])].append(i)
+            places[Place(episode, int(outputs.stamp_ns[i]))].append(i)
     latest = before = 0
     for step, (frame, stamp, sequence) in enumerate(
         zip(answers.frame_id.tolist(), answers.stamp_ns.tolist(), answers.sequence.tolist(), strict=True)
     ):
-        digest, _, episode = frame.partition(" ")
-        candidates = places.get((episode, stamp), [])
+        digest, label = AnswerLabel.parse(frame)
+        candidates = places.get(Place(label, stamp), [])
         while candidates and candidates[-1] < latest:
             candidates.pop()
         if candidates:
             latest = candidates[-1]
         new_publisher = sequence == 1 and (step == 0 or before > 0)
         follows = not sequence or sequence == before + 1
-        yield _Answer(step, stamp, digest, episode, latest if candidates else -1, new_publisher, follows)
+        yield _Answer(step, stamp, digest, label, latest if candidates else -1, new_publisher, follows)
         before = sequence
 
 

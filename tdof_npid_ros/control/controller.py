@@ -132,25 +132,22 @@ class Controller:
         self.begin_within(applied)
         self._rest = setpoint
 
-    def answer(self, stamp_ns: int, setpoint: np.ndarray, output: np.ndarray) -> bool:
-        """Answer the output of `stamp_ns`; the answer is in `effort` and `terms`.
+    def answer(self, stamp_ns: int, setpoint: np.ndarray, output: np.ndarray) -> np.ndarray:
+        """The answer u to the output of `stamp_ns`, (lanes,): `effort`, which the next answer overwrites.
 
         The same stamp again leaves everything as it is, so the answer is the same and no state advances.
 
         Args:
             setpoint, output: (lanes,), finite.
-
-        Returns:
-            Whether this was a new stamp.
         """
         if stamp_ns == self.stamp_ns:
-            return False
+            return self.effort
         if not self._settled:
             self._settle(setpoint, output)
         self.stamp_ns = stamp_ns
         self._law.answer(setpoint, output, self._state, self._shaping, self.effort, self.terms)
         self._latest = setpoint, output
-        return True
+        return self.effort
 
     def _allocate(self) -> None:
         lanes = self._law.gains.lanes

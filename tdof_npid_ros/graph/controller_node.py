@@ -19,7 +19,7 @@ from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, LARGEST_S
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
-from tdof_npid_ros.control.stamps import Stamps, begins_from_nothing
+from tdof_npid_ros.control.session import OUT_OF_STEP, Answer, Outcome, Session
 from tdof_npid_ros.graph.runtime.endpoints import signal_qos
 from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
@@ -33,8 +33,7 @@ from tdof_npid_ros.graph.runtime.node import (
     number,
     run_node,
 )
-from tdof_npid_ros.scenario import Plan, episode_named
-from tdof_npid_ros.wire import NO_VALUES, Sample, SignalWriter
+from tdof_npid_ros.wire import Sample, SignalWriter
 
 DESCRIPTIONS = {
     "type": f"control law: {', '.join(CONTROLLER_TYPES)}",
@@ -63,7 +62,6 @@ DESCRIPTIONS = {
     "bumpless": "true: changes of gains and type do not move the effort at once",
 }
 RANGES = {"output_timeout": (0.0, 3600.0), **TIMING_RANGES}
-OUT_OF_STEP = "plant and controller differ in sample_period: give both the same"
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
 
@@ -87,13 +85,10 @@ class ControllerNode(LoopEnd):
                 f"joint_names has {len(self.joints.names)} names, but the gains are for {self.controller.lanes} lanes: "
                 "give kp one value per joint"
             )
+        self.session = Session(self.controller, self.joints)
         options = self.values_of(["setpoint", "output_timeout"])
         self.checked(options)
         self.changed(options)
-        self.saved_integral: np.ndarray | None = None
-        self.plan: Plan | None = None
-        self.stamps = Stamps()
-        self.waiting: Sample | None = None
         self.accept_changes()
 
     def _declare_options(self) -> None:
@@ -110,17 +105,10 @@ class ControllerNode(LoopEnd):
     def activate(self) -> None:
         """Create topics, services and timers."""
         self.prepare_for_realtime()
-        self.stamps.forget()
-        self.waiting, self.is_out_of_step = None, False
-        self.answered = NO_VALUES  # the latest output that was
-        self.controller.reset()
-        self.takes_output_as_setpoint = bool(self.values_of(["hold_output"])["hold_output"])
-        self.latest_arrival_ns: int | None = None
-        self.silent = False
-        self.common_setpoint = np.zeros(self.controller.lanes)
+        self.session.begin()
+        self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
         self.effort = SignalWriter()
-        self.effort_for = ("", "")
-        self.answer = b""
+        self.effort_label = ""
         self.terms = SignalWriter()
         self.terms_for = 0
         qos = self.promised_qos()
@@ -135,9 +123,9 @@ class ControllerNode(LoopEnd):
     def deactivate(self) -> None:
         """Keep what outlasts an inactive time."""
         if not self.values_of(["save_i_term"])["save_i_term"]:
-            self.saved_integral = None
+            self.session.saved_integral = None
         elif self.controller.stamp_ns is not None:
-            self.saved_integral = self.controller.integral
+            self.session.saved_integral = self.controller.integral
 
     # What arrives
 
@@ -147,9 +135,9 @@ class ControllerNode(LoopEnd):
         except ValueError as error:
             self.refuse("rejected", "scenario_plan refused", f": {error}")
             return
-        self.plan = plan
-        if self.waiting is not None:
-            self._on_output(self.waiting)
+        self.session.plan = plan
+        if self.session.waiting is not None:
+            self._on_output(self.session.waiting)
 
     def _on_setpoint(self, sample: Sample) -> None:
         r = self._picked("setpoint", sample.name, sample.position)
@@ -158,10 +146,7 @@ class ControllerNode(LoopEnd):
         if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
             self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
-            self._take_setpoint(r)
-
-    def _take_setpoint(self, setpoint: np.ndarray) -> None:
-        self.setpoint, self.takes_output_as_setpoint = setpoint, False
+            self.session.set_setpoint(r)
 
     def _on_manual_effort(self, sample: Sample) -> None:
         values = self._picked("manual_effort", sample.name, sample.effort)
@@ -173,108 +158,43 @@ class ControllerNode(LoopEnd):
             self.counts["rejected"] += 1
 
     def _on_output(self, output: Sample) -> None:
-        stamp, episode = output.stamp_ns, episode_named(output.frame_id)
-        y = self._picked("output", output.name, output.position)
-        if y is None or not self.is_valid("output", y, self.controller.lanes, LARGEST_SIGNAL):
-            return
-        self.waiting = None
-        if episode:
-            if self.plan is None or not episode.startswith(self.plan.digest):
-                self.waiting = output  # its plan is on the way
-                return
-            setpoint = self._on_every_lane(self.plan.value_at("setpoint", stamp))
-        else:
-            if self.takes_output_as_setpoint:
-                self._take_setpoint(y)
-            setpoint = self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
-        before = self.stamps.latest_ns
-        verdict = self.stamps.take(stamp, episode)
-        if verdict == "late":
-            self.counts["late"] += 1
-            return
-        if verdict == "same" and not episode and not np.array_equal(y, self.answered):
-            self.refuse("rejected", "output refused: it has changed, but its stamp has not", "; stamp each message")
-            return
-        if verdict == "new" and episode and before is not None:
-            self._check_period(stamp - before)
-        self.answered = y
-        begins_within = self._begin_if_needed(verdict == "restart", stamp, episode, output)
-        is_new = self.controller.answer(stamp, setpoint, y)
-        if is_new:
-            self.answer = self._answer(stamp, episode, setpoint, begins_within)
-        self.effort_publisher.publish(self.answer)
-        # The plant waits for the answer, so all else comes after it.
-        self._note_answer(stamp, is_new)
+        outcome = self.session.take(output, time.monotonic_ns())
+        if outcome.answer is not None:
+            self.effort_publisher.publish(self._message(outcome.answer))
+        self._account_for(outcome)  # the plant waits for the answer, so all else comes after it
 
-    def _check_period(self, apart_ns: int) -> None:
-        """In lockstep outputs come every sample period; if not, plant and controller were given different ones."""
-        period_ns = self.controller.sample_period_ns
-        self.is_out_of_step = apart_ns != period_ns
-        if self.is_out_of_step:
-            self.refuse("out_of_step", OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s")
-
-    def _on_every_lane(self, setpoint: float) -> np.ndarray:
-        """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
-        if setpoint != self.common_setpoint[0] or len(self.common_setpoint) != self.controller.lanes:
-            self.common_setpoint = np.full(self.controller.lanes, setpoint)
-        return self.common_setpoint
-
-    def _begin_if_needed(self, restarts: bool, stamp: int, episode: str, output: Sample) -> bool:
-        """Reset the controller at a loop's start, or let it begin within a running loop; True for the latter."""
-        now = time.monotonic_ns()
-        latest, self.latest_arrival_ns = self.latest_arrival_ns, now
-        was_silent = not episode and latest is not None and 0 < self.output_timeout_ns < now - latest
-        if self.silent or was_silent:
-            self.silent = False
-            self.get_logger().info("output comes again: going on")
-        if not (restarts or was_silent):
-            return False
-        saved, self.saved_integral = self.saved_integral, None
-        if restarts and begins_from_nothing(stamp, episode):
-            self.controller.reset()
-            return False
-        applied = self._applied(output)
-        if applied is None:
-            return False
-        self.controller.begin_within(applied, saved if saved is not None and len(saved) == len(applied) else None)
-        return True
-
-    def _applied(self, output: Sample) -> np.ndarray | None:
-        """The effort that the plant reports, or else our own latest; None if the controller is to begin from
-        nothing."""
-        applied = self._picked("output", output.name, output.effort)
-        if applied is not None and len(applied) == self.controller.lanes and np.isfinite(applied).all():
-            return applied
-        if self.counts["steps"]:
-            return self.controller.effort.copy()
-        self.controller.reset()
-        return None
-
-    def _answer(self, stamp: int, episode: str, setpoint: np.ndarray, begins_within: bool) -> bytes:
-        controller, digest = self.controller, self.controller.digest
-        if self.effort_for != (digest, episode):
-            self.effort_for = (digest, episode)
-            names = self.joints.names or lane_names(controller.lanes)
-            self.effort.label(f"{digest} {episode}" if episode else digest, names)
+    def _message(self, answer: Answer) -> bytes:
+        label = str(answer.label)
+        if self.effort_label != label:
+            self.effort_label = label
+            self.effort.label(label, self.joints.names or lane_names(self.controller.lanes))
         # The first answer within a running loop bears the integral action that it began with, for `verify`.
-        began_with = controller.integral_before if begins_within else NO_VALUES
-        return self.effort.write(stamp, position=setpoint, velocity=began_with, effort=controller.effort)
+        return self.effort.write(
+            answer.stamp_ns, position=answer.setpoint, velocity=answer.began_with, effort=answer.effort
+        )
+
+    def _account_for(self, outcome: Outcome) -> None:
+        decision, answer, why, detail, after_silence = outcome
+        if after_silence:
+            self.get_logger().info("output comes again: going on")
+        if why:
+            self.refuse("rejected" if answer is None else "out_of_step", why, detail)
+        if decision == "late":
+            self.counts["late"] += 1
+        elif decision == "same":
+            self.counts["repeated"] += 1
+        elif answer is not None:
+            self.counts["steps"] += 1
+            if self.controller.saturated:
+                self.counts["saturated"] += 1
+            if self.state_publisher.get_subscription_count():
+                self._publish_terms(answer.stamp_ns)
 
     def _on_effort_matched(self, status: Any) -> None:
         """A reader of `control_effort` has come. A plant in lockstep may be waiting for what it could not hear yet."""
-        if status.current_count_change > 0 and self.effort_for[1]:
-            self.effort_publisher.publish(self.answer)
-
-    def _note_answer(self, stamp: int, is_new: bool) -> None:
-        controller = self.controller
-        if not is_new:
-            self.counts["repeated"] += 1
-            return
-        self.counts["steps"] += 1
-        if controller.saturated:
-            self.counts["saturated"] += 1
-        if self.state_publisher.get_subscription_count():
-            self._publish_terms(stamp)
+        session = self.session
+        if status.current_count_change > 0 and session.answer is not None and not session.is_live:
+            self.effort_publisher.publish(self._message(session.answer))
 
     def _picked(self, topic: str, names: Sequence[str], values: np.ndarray) -> np.ndarray | None:
         """A signal's values for the lanes; None if it is refused."""
@@ -285,13 +205,10 @@ class ControllerNode(LoopEnd):
             return None
 
     def _look_for_silence(self) -> None:
-        if self.silent or not self.output_timeout_ns or self.latest_arrival_ns is None or self.effort_for[1]:
-            return
-        if time.monotonic_ns() - self.latest_arrival_ns > self.output_timeout_ns:
-            self.silent = True
+        if self.session.look_for_silence(time.monotonic_ns()):
             self.counts["silences"] += 1
             self.get_logger().error(
-                f"no output for {self.output_timeout_ns / 1e9:g} s: the integral action waits. Look after the plant"
+                f"no output for {self.session.timeout_ns / 1e9:g} s: the integral action waits. Look after the plant"
             )
 
     # What goes out
@@ -309,7 +226,7 @@ class ControllerNode(LoopEnd):
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         gains, _ = self._configured(changes)
-        setpoint = self._setpoint(changes["setpoint"]) if "setpoint" in changes else self.setpoint
+        setpoint = self._setpoint(changes["setpoint"]) if "setpoint" in changes else self.session.setpoint
         if len(setpoint) not in (1, gains.lanes):
             raise ValueError(
                 f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or "
@@ -324,9 +241,9 @@ class ControllerNode(LoopEnd):
         if any(name in DESCRIPTIONS for name in changes):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
-            self._take_setpoint(self._setpoint(changes["setpoint"]))
+            self.session.set_setpoint(self._setpoint(changes["setpoint"]))
         if "output_timeout" in changes:
-            self.output_timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
+            self.session.timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
 
     def _configured(self, changes: dict[str, Any]) -> tuple[Gains, ControllerOptions]:
         """Gains and options with some parameters changed; ValueError if they are not valid."""
@@ -347,7 +264,7 @@ class ControllerNode(LoopEnd):
     @property
     def _answers_live_outputs(self) -> bool:
         """Whether it is in a loop in realtime, whose number of lanes is not ours to change."""
-        return self.active and self.latest_arrival_ns is not None and not self.effort_for[1] and not self.silent
+        return self.active and self.session.is_live and not self.session.silent
 
     def _setpoint(self, value: Any) -> np.ndarray:
         one_per_lane = value if isinstance(value, list) else [value]
@@ -360,14 +277,15 @@ class ControllerNode(LoopEnd):
             "lanes": self.controller.lanes,
             "parameters": self.controller.digest,
         }
-        if self.waiting is not None:
+        session = self.session
+        if session.waiting is not None:
             return WARN, "an output waits for its plan on scenario_plan: start the scenario", facts
-        if self.stamps.latest_ns is None:
+        if session.stamp_ns is None:
             return WARN, "no output yet: start the plant, or remap output to your robot's joint_states", facts
-        facts["time_s"] = self.stamps.latest_ns / 1e9
-        if self.silent:
+        facts["time_s"] = session.stamp_ns / 1e9
+        if session.silent:
             return ERROR, "output has stopped: look after the plant; the effort is as it was", facts
-        if self.is_out_of_step:
+        if session.is_out_of_step:
             return ERROR, OUT_OF_STEP, facts
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts

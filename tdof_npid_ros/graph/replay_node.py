@@ -15,7 +15,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
-from tdof_npid_ros.analysis.compare import Comparison, Recorded
+from tdof_npid_ros.analysis.compare import Comparison, Key, Recorded
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
@@ -23,7 +23,7 @@ from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
-from tdof_npid_ros.wire import SECOND, Sample
+from tdof_npid_ros.wire import SECOND, AnswerLabel, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
@@ -70,7 +70,7 @@ class ReplayNode(LoopNode):
         """Publish from a thread, so that the node stays at hand."""
         self.stopping = threading.Event()
         self.answered = threading.Condition()
-        self.answer: tuple[str, int] | None = None
+        self.answer: Key | None = None
         self.publishers_of = {topic: publisher for topic in self._topics() if (publisher := self._publisher(topic))}
         self.clock_publisher = self.create_publisher(Clock, CLOCK, 10) if self.clock else None
         if self.compare:
@@ -187,7 +187,7 @@ class ReplayNode(LoopNode):
 
     def _on_answer(self, answer: Sample) -> None:
         assert self.recorded is not None
-        digest, _, episode = answer.frame_id.partition(" ")
+        digest, episode = AnswerLabel.parse(answer.frame_id)
         key = episode, answer.stamp_ns
         with self.answered:
             if key != self.answer:

@@ -6,24 +6,24 @@ import numpy as np
 
 from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
 from tdof_npid_ros.plants.simulator import PlantSimulator
-from tdof_npid_ros.scenario import Plan, episode_named
+from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 
 class Episode:
     """One run of a plan by a plant that takes only the answer to its latest output.
 
     Attributes:
-        name: `<plan digest>/<number>`, what outputs bear in `header.frame_id`.
+        label: what outputs bear in `header.frame_id`.
         steps: number of steps; the outputs are those of steps 0 to `steps`.
         stamp_ns: of the output that waits for an answer.
     """
 
-    def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, number: int) -> None:
-        plant_at(plan.plant_changes(0))  # its names first: to sample a plan takes memory
+    def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, label: EpisodeLabel) -> None:
         signals = plan.sampled(simulator.sample_period_ns)
         if plan.start is not None:
             simulator.reset(plant_at_start(plant_at, plan.start, signals.segments[0].plant, simulator.effort_limits))
-        self.name = f"{plan.digest}/{number}"
+        self.label = label
         self.steps = signals.steps
         self.stamp_ns = 0
         self._simulator = simulator
@@ -32,11 +32,9 @@ class Episode:
         self._plants = {segment.first: plant_at(segment.plant) for segment in signals.segments}
         self._k = 0
 
-    def awaits(self, stamp_ns: int, answer_name: str) -> bool:
+    def awaits(self, stamp_ns: int, answer: AnswerLabel) -> bool:
         """Whether an answer of that stamp is the one; an answer that names an episode must name this one."""
-        if stamp_ns != self.stamp_ns:
-            return False
-        return answer_name.endswith(self.name) or not episode_named(answer_name.rpartition(" ")[2])
+        return stamp_ns == self.stamp_ns and answer.episode in (None, self.label)
 
     def answer(self, effort: np.ndarray) -> bool:
         """Take the answer, (lanes,), and go on one step. Returns False if the episode ends with it."""

@@ -5,7 +5,6 @@ It knows no ROS. A loop is anything that runs an episode with one lane per candi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, TypeVar
@@ -17,6 +16,7 @@ from tdof_npid_ros.loop import LARGEST_OUTPUT, Integrals
 from tdof_npid_ros.scenario import SampledPlan
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.problem import EPISODES
+from tdof_npid_ros.wire import EpisodeLabel
 
 Indices = NDArray[np.intp]
 
@@ -49,7 +49,7 @@ def integrals_of(signals: SampledPlan, output: Array) -> Integrals:
 
 
 class EpisodeOutputs:
-    """Collects the outputs of one episode, whose name is `<plan digest>/<number>`.
+    """Collects the outputs of one episode.
 
     Of several episodes of the plan the latest counts: a plan that arrives once more starts it over.
 
@@ -62,28 +62,29 @@ class EpisodeOutputs:
         self._digest, self._signals, self._lanes = digest, signals, lanes
         self._output = np.empty((signals.steps + 1, lanes))
         self._seen = bytearray(signals.steps + 1)
-        self._name, self._number = "", 0
-        self._least: float = math.inf
+        self._label: EpisodeLabel | None = None
+        self._started: EpisodeLabel | None = None
         self.received = 0
         self.cut = False
 
-    def started(self, number: int) -> None:
-        """The loop says that the episode has begun, as number `number`: earlier ones do not count."""
-        self._least = number
+    def started(self, label: EpisodeLabel) -> None:
+        """The loop says that the episode has begun, and its label: earlier ones do not count."""
+        self._started = label
 
     @property
     def complete(self) -> bool:
         """Whether every output has come, of an episode that counts."""
-        return self.received > self._signals.steps and self._number >= self._least
+        whole = self.received > self._signals.steps
+        return whole and self._started is not None and self._label is not None and self._counts(self._label)
 
     @property
     def integrals(self) -> Integrals:
         """Of the complete episode."""
         return integrals_of(self._signals, self._output)
 
-    def take(self, name: str, stamp_ns: int, output: Array) -> None:
-        """Take the output (lanes,) of an episode's name and a stamp."""
-        if name != self._name and not self._changed_to(name, len(output)):
+    def take(self, label: EpisodeLabel | None, stamp_ns: int, output: Array) -> None:
+        """Take the output (lanes,) of an episode's label and a stamp."""
+        if label != self._label and not self._changed_to(label, len(output)):
             return
         step = stamp_ns // self._signals.sample_period_ns
         if len(output) != self._lanes or step > self._signals.steps or self._seen[step]:
@@ -94,17 +95,22 @@ class EpisodeOutputs:
         if step == self._signals.steps and self.received <= step:
             self.cut = True
 
-    def _changed_to(self, name: str, lanes: int) -> bool:
-        """Whether outputs of the episode `name` are to be taken from now on."""
-        digest, _, number = name.partition("/")
-        if not number.isdigit():
+    def _counts(self, label: EpisodeLabel) -> bool:
+        """Whether this is the episode that was started, or a later one of the plant's activation."""
+        return self._started is not None and (label == self._started or label.follows(self._started))
+
+    def _changed_to(self, label: EpisodeLabel | None, lanes: int) -> bool:
+        """Whether outputs of this episode are to be taken from now on."""
+        if label is None:
             return False
-        if digest != self._digest:
-            self.cut = self.cut or int(number) > self._least
+        if label.plan != self._digest:
+            self.cut = self.cut or self._counts(label)
             return False
-        if int(number) <= self._number or lanes != self._lanes:
+        now = self._label
+        earlier = now is not None and now.activation == label.activation and not label.follows(now)
+        if earlier or lanes != self._lanes:
             return False
-        self._name, self._number = name, int(number)
+        self._label = label
         self._seen = bytearray(self._signals.steps + 1)
         self.received = 0
         return True

@@ -1,5 +1,6 @@
 """The sample bag is sound, and the viewers' layouts show what is in it."""
 
+import hashlib
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -12,6 +13,8 @@ import pytest
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.analysis.verify import verify
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.case import load_case
+from tdof_npid_ros.control.controller import parameters_digest
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "bags" / "sample"
@@ -33,6 +36,20 @@ def test_it_is_whole_and_every_effort_is_verified(reader) -> None:
     assert not reader.truncated and reader.custom_data["lost"] == "0"
     account = verify(SAMPLE)
     assert account.sound and account.equal > 2000 and not account.unverifiable
+
+
+def test_it_is_the_one_that_was_recorded_in_2026(reader) -> None:
+    """What was recorded stays good: this bag is not to be recorded anew. Its labels are of the old form."""
+    data = hashlib.sha256((SAMPLE / "sample_0.mcap").read_bytes()).hexdigest()
+    assert data == "09a6fe8637776cdc036014da9221eaeefb6dc9f8ca3f8a5c2269eef8141250da"
+    frames = set(reader.columns("/output", ["header.frame_id"])["header.frame_id"])
+    assert frames == {"9002efe4783f/1", "bb63a0f0eb0b/2"}
+
+
+def test_options_at_their_defaults_leave_a_parameters_digest_as_it_was(reader) -> None:
+    frames = reader.columns("/control_effort", ["header.frame_id"])["header.frame_id"]
+    case = load_case("p1-c0.5")
+    assert {frame.partition(" ")[0] for frame in frames} == {parameters_digest(case.gains, case.sample_period_ns)}
 
 
 def test_its_episodes_are_the_simulation(reader) -> None:

@@ -15,7 +15,7 @@ from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import AntiWindup, Gains, GainsError
 from tdof_npid_ros.control.law import TERMS, tracking_time
-from tdof_npid_ros.control.stamps import Stamps
+from tdof_npid_ros.control.session import OutputSequence, Place
 
 H = 1.0  # s: as there, so that an error of 1 adds ki to the integral action
 PERIOD_NS = 1_000_000_000
@@ -187,13 +187,17 @@ def test_no_time_passed_is_the_same_answer_and_no_integration() -> None:
     controller = Controller(Gains("pid", kp=1.0, ki=1.0), PERIOD_NS)
     controller.answer(5, np.ones(1), np.zeros(1))
     before, integral = controller.effort[0], controller.integral[0]
-    assert not controller.answer(5, np.full(1, 7.0), np.zeros(1))
+    assert controller.answer(5, np.full(1, 7.0), np.zeros(1))[0] == before
     assert (controller.effort[0], controller.integral[0]) == (before, integral)
 
 
 def test_time_that_goes_back_is_not_answered() -> None:
-    stamps = Stamps()
-    assert [stamps.take(stamp, "") for stamp in (10, 20, 15, 20, 30)] == ["restart", "new", "late", "same", "new"]
+    sequence, decisions = OutputSequence(PERIOD_NS), []
+    for stamp in (10, 20, 15, 20, 30):
+        decisions.append(sequence.judge(Place(None, stamp)).decision)
+        if decisions[-1] in ("join", "new"):
+            sequence.accept(Place(None, stamp))
+    assert decisions == ["join", "new", "late", "same", "new"]
 
 
 @pytest.mark.parametrize("period", [0.0, -0.01, math.nan, math.inf, "fast", True])

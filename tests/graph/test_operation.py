@@ -110,6 +110,20 @@ def test_manual_mode_by_topic_and_bumpless_return(live: Live) -> None:
     live.settle()
 
 
+def test_an_unstamped_message_beside_a_steady_loop_changes_nothing_and_is_told(live: Live) -> None:
+    """ros2 topic pub --once /live/output sensor_msgs/msg/JointState "{position: [2.0]}" """
+    from sensor_msgs.msg import JointState
+
+    live.settle()
+    since, output = len(live.efforts) - 1, live.graph.publisher("/live/output", JointState)
+    stray, told = JointState(position=[2.0]), "output refused: it bears no label"
+    live.graph.publish_until(output, stray, lambda: told in live.controller.log, what="a refusal")
+    efforts = live.wait_for_efforts(100, since)
+    live.graph.node.destroy_publisher(output)
+    assert largest_step(efforts) < 0.05
+    assert np.allclose(efforts, 1.0, atol=0.1)
+
+
 def test_inactive_publishes_nothing_and_comes_back_without_a_jump(live: Live) -> None:
     live.settle()
     assert live.graph.set_parameters(live.plant_name, fallback="hold")[0].successful

@@ -17,6 +17,7 @@ from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError, integrals_of, measure, work_of_loops
 from tdof_npid_ros.tuning.objective import Objective, objective_values
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
+from tdof_npid_ros.wire import EpisodeLabel
 
 SHORT = {"setpoint": ("0 setpoint 1", "5 end"), "disturbance": ("0 disturbance 1", "5 end")}
 CASE = replace(load_case("p3-c1"), episodes=SHORT)
@@ -102,50 +103,66 @@ SIGNALS = CASE.signals["setpoint"]
 PERIOD = CASE.sample_period_ns
 
 
-def send(outputs: EpisodeOutputs, name: str, steps: range, output: float = 0.5) -> None:
+PLAN, OTHER = "0123456789ab", "ba9876543210"
+
+
+def label(number: int, plan: str = PLAN, activation: str = "a") -> EpisodeLabel:
+    return EpisodeLabel(plan, activation, number)
+
+
+def send(outputs: EpisodeOutputs, episode: EpisodeLabel | None, steps: range, output: float = 0.5) -> None:
     for step in steps:
-        outputs.take(name, step * PERIOD, np.full(2, output))
+        outputs.take(episode, step * PERIOD, np.full(2, output))
 
 
 def test_an_episode_is_complete_with_its_last_output_repeated_ones_or_not() -> None:
-    outputs = EpisodeOutputs("abc", SIGNALS, 2)
-    send(outputs, "abc/2", range(SIGNALS.steps))
-    send(outputs, "abc/2", range(10))
-    outputs.started(2)
+    outputs = EpisodeOutputs(PLAN, SIGNALS, 2)
+    send(outputs, label(2), range(SIGNALS.steps))
+    send(outputs, label(2), range(10))
+    outputs.started(label(2))
     assert not outputs.complete
-    send(outputs, "abc/2", range(SIGNALS.steps, SIGNALS.steps + 1))
+    send(outputs, label(2), range(SIGNALS.steps, SIGNALS.steps + 1))
     assert outputs.complete
     assert not outputs.cut
     assert outputs.integrals.iae == pytest.approx([2.5, 2.5])
 
 
 def test_only_the_episode_that_was_started_last_counts() -> None:
-    outputs = EpisodeOutputs("abc", SIGNALS, 2)
-    send(outputs, "abc/1", range(SIGNALS.steps + 1), output=7.0)
-    outputs.started(2)
+    outputs = EpisodeOutputs(PLAN, SIGNALS, 2)
+    send(outputs, label(1), range(SIGNALS.steps + 1), output=7.0)
+    outputs.started(label(2))
     assert not outputs.complete
-    send(outputs, "abc/2", range(SIGNALS.steps + 1))
-    send(outputs, "abc/1", range(3), output=7.0)
+    send(outputs, label(2), range(SIGNALS.steps + 1))
+    send(outputs, label(1), range(3), output=7.0)
     assert outputs.complete
     assert outputs.integrals.iae == pytest.approx([2.5, 2.5])
 
 
 def test_an_episode_is_cut_by_another_plan_or_a_missing_output() -> None:
-    for name, steps in [("other/3", range(1)), ("abc/2", range(5, SIGNALS.steps + 1))]:
-        outputs = EpisodeOutputs("abc", SIGNALS, 2)
-        outputs.started(2)
-        send(outputs, "abc/2", range(2))
-        send(outputs, name, steps)
+    for episode, steps in [(label(3, OTHER), range(1)), (label(2), range(5, SIGNALS.steps + 1))]:
+        outputs = EpisodeOutputs(PLAN, SIGNALS, 2)
+        outputs.started(label(2))
+        send(outputs, label(2), range(2))
+        send(outputs, episode, steps)
         assert outputs.cut
         assert not outputs.complete
 
 
 def test_outputs_with_other_lanes_or_of_a_robot_are_passed_over() -> None:
-    outputs = EpisodeOutputs("abc", SIGNALS, 3)
-    outputs.started(1)
-    send(outputs, "abc/1", range(5))
-    send(outputs, "base_link", range(5))
+    outputs = EpisodeOutputs(PLAN, SIGNALS, 3)
+    outputs.started(label(1))
+    send(outputs, label(1), range(5))
+    send(outputs, None, range(5))
     assert (outputs.received, outputs.cut) == (0, False)
+
+
+def test_a_plant_that_is_activated_again_counts_anew() -> None:
+    outputs = EpisodeOutputs(PLAN, SIGNALS, 2)
+    send(outputs, label(7), range(3), output=7.0)
+    outputs.started(label(1, activation="b"))
+    send(outputs, label(1, activation="b"), range(SIGNALS.steps + 1))
+    assert outputs.complete
+    assert outputs.integrals.iae == pytest.approx([2.5, 2.5])
 
 
 # Steps back and forth

@@ -2,48 +2,43 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 from rosgraph_msgs.msg import Clock as ClockMessage
 from trajectory_msgs.msg import JointTrajectory
 
+from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.recorder.lossless import Log
 from tdof_npid_ros.graph.runtime.messages import plan_from_message, set_stamp
 from tdof_npid_ros.graph.runtime.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
-from tdof_npid_ros.wire import Sample
+from tdof_npid_ros.wire import AnswerLabel, Sample
 
-if TYPE_CHECKING:
-    from tdof_npid_ros.graph.plant.node import PlantNode
-
-Phase = Literal["waiting", "running", "stopped", "finished"]
 CLOCK_PERIOD = 0.05  # s of wall time between two /clock messages
 
 
 class LockstepPlant:
     """Runs the latched plan, episode by episode; takes only the answer to the output that waits for it."""
 
-    def __init__(self, node: PlantNode) -> None:
-        self._node = node
+    def __init__(self, port: PlantPort) -> None:
+        self._port, self._node = port, port.node
         self.plan: Plan | None = None
         self.episode: Episode | None = None
-        self.episodes = 0
-        self.phase: Phase = "waiting"
 
     def activate(self) -> None:
         """Create the topics and timers, and wait for the plan, which is latched."""
         node = self._node
-        self.plan, self.episode, self.phase = None, None, "waiting"
+        self.plan, self.episode = None, None
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         node.subscribe_signal("control_effort", self._on_answer, RECENT_QOS, sole=True)
         self.held = False  # an output waits for the log
-        self.log = Log(node, node.period_ns, self._on_log_grown) if node.lossless else None
-        timeout = float(node.values_of(["reply_timeout"])["reply_timeout"])
-        node.create_timer(timeout, self._on_reply_timeout, clock=STEADY)
-        if node.get_parameter("publish_clock").value:
+        p = node.values_of(["lossless", "reply_timeout", "publish_clock"])
+        self.log = Log(node, self._port.period_ns, self._on_log_grown) if p["lossless"] else None
+        node.create_timer(float(p["reply_timeout"]), self._on_reply_timeout, clock=STEADY)
+        if p["publish_clock"]:
             node.create_timer(CLOCK_PERIOD, self._publish_clock, clock=STEADY)
 
     def _on_plan(self, message: JointTrajectory) -> None:
@@ -60,52 +55,57 @@ class LockstepPlant:
             self._start_episode(self.plan)
         except (ValueError, ArithmeticError) as error:
             return False, str(error)
-        return True, f"episode {self.episodes} of plan {self.plan.digest} started"
+        return True, f"episode {self._port.label.number} of plan {self.plan.digest} started"
 
     def _start_episode(self, plan: Plan) -> None:
         """Begin it; a plan that the plant cannot follow raises ValueError, and changes nothing."""
-        node = self._node
-        simulator = node.new_simulator()
-        episode = Episode(plan, simulator, node.plant_at, self.episodes + 1)
-        node.simulator, self.plan, self.episode = simulator, plan, episode
-        self.episodes += 1
-        self.phase, self.repeats = "running", 0
-        node.label_output(episode.name)
-        node.get_logger().info(f"episode {self.episodes}: plan {plan.digest}, {episode.steps} steps")
-        self.held = False
-        node.publish_output(0)
-        node.publish_diagnostics()
+        port = self._port
+        simulator, label = port.new_simulator(), port.next_label(plan.digest)
+        episode = Episode(plan, simulator, port.plant_at, label)
+        self.plan, self.episode = plan, episode
+        self.repeats, self.held = 0, False
+        port.begin(label, simulator)
+        self._node.get_logger().info(f"episode {label.number}: plan {plan.digest}, {episode.steps} steps")
+        port.publish_output(0)
+        self._node.publish_diagnostics()
 
     def _on_answer(self, answer: Sample) -> None:
         node, episode = self._node, self.episode
-        if episode is None or self.phase == "finished" or not episode.awaits(answer.stamp_ns, answer.frame_id):
+        if (
+            episode is None
+            or self._port.phase == "finished"
+            or not episode.awaits(answer.stamp_ns, AnswerLabel.parse(answer.frame_id))
+        ):
             node.counts["late"] += 1
             return
-        effort = node.effort_of(answer)
+        effort = self._port.effort_of(answer)
         if effort is None:
             return
         if not self._is_logged(episode):
             return  # it comes again
-        if self.phase == "stopped":
+        if self._port.phase == "stopped":
             node.get_logger().info("the controller answers again: going on")
-            self.phase = "running"
-        if episode.answer(effort):
+            self._port.tell("running")
+        goes_on = episode.answer(effort)
+        if goes_on:
             self._publish_when_logged(episode)
-        else:
-            self.phase = "finished"
-            node.get_logger().info(f"episode {self.episodes} finished")
-            self._publish_clock()
         node.counts["steps"] += 1
-        if self.phase == "finished":
-            node.publish_diagnostics()
+        if not goes_on:
+            self._finish(episode)
+
+    def _finish(self, episode: Episode) -> None:
+        self._port.tell("finished")
+        self._node.get_logger().info(f"episode {episode.label.number} finished")
+        self._publish_clock()
+        self._node.publish_diagnostics()
 
     def _publish_when_logged(self, episode: Episode) -> None:
         self.held = self.log is not None and not self.log.is_near(episode.stamp_ns)
         if not self.held:
-            self._node.publish_output(episode.stamp_ns)
+            self._port.publish_output(episode.stamp_ns)
 
     def _on_log_grown(self) -> None:
-        if self.phase != "running" or self.episode is None:
+        if self._port.phase != "running" or self.episode is None:
             return
         if self.held:
             self._publish_when_logged(self.episode)
@@ -114,26 +114,26 @@ class LockstepPlant:
 
     def _is_logged(self, episode: Episode) -> bool:
         """Whether an answer may be taken: the first and the last one not before they are in the log."""
-        return self.log is None or not self._is_end(episode) or self.log.holds(episode.name, episode.stamp_ns)
+        return self.log is None or not self._is_end(episode) or self.log.holds(str(episode.label), episode.stamp_ns)
 
     def _is_end(self, episode: Episode) -> bool:
-        return episode.stamp_ns in (0, episode.steps * self._node.period_ns)
+        return episode.stamp_ns in (0, episode.steps * self._port.period_ns)
 
     def _on_reply_timeout(self) -> None:
         node, episode = self._node, self.episode
-        if self.phase != "running" or episode is None:
+        if self._port.phase != "running" or episode is None:
             return
         if self.held or not self._is_logged(episode):
             node.refuse("held_up", "lossless: waiting for the recorder; start one with lossless in this namespace")
             if not self.held:
-                node.publish_output(episode.stamp_ns)
+                self._port.publish_output(episode.stamp_ns)
             return
-        waiting = (self.episodes, episode.stamp_ns)
+        waiting = (self._port.label.number, episode.stamp_ns)
         if waiting != self.waiting:
             self.waiting, self.repeats = waiting, 0
             return
         if self.repeats >= node.values_of(["retries"])["retries"]:
-            self.phase = "stopped"
+            self._port.tell("stopped")
             node.get_logger().error(
                 f"no answer to the output at {episode.stamp_ns / 1e9:g} s after {self.repeats} repetitions: stopped. "
                 "Start a controller in this namespace, or call plant/reset"
@@ -147,15 +147,15 @@ class LockstepPlant:
     def _repeat_output(self, episode: Episode) -> None:
         self.repeats += 1
         self._node.counts["repeated"] += 1
-        self._node.publish_output(episode.stamp_ns)
+        self._port.publish_output(episode.stamp_ns)
 
     def on_matched(self, status: Any) -> None:
         """A subscriber of `output` has come: if it is the controller, it can go on."""
         if self.episode is None or status.current_count_change <= 0:
             return
         self.repeats = 0  # what was published before, it may not have heard
-        if self.phase == "stopped":
-            self.phase = "running"
+        if self._port.phase == "stopped":
+            self._port.tell("running")
             self._repeat_output(self.episode)
 
     def _publish_clock(self) -> None:
@@ -171,14 +171,14 @@ class LockstepPlant:
     def state(self) -> tuple[int, str, dict[str, object]]:
         """As `LoopNode.state`."""
         facts: dict[str, object] = {
-            "episode": self.episodes,
-            "state": self.phase,
+            "episode": self._port.label.number,
+            "state": self._port.phase,
             "plan": self.plan.digest if self.plan else "",
         }
         if self.episode is not None:
             facts["time_s"] = self.episode.stamp_ns / 1e9
-        if self.phase == "stopped":
+        if self._port.phase == "stopped":
             return ERROR, "no controller answers: start one, or call plant/reset", facts
-        if self.phase == "waiting":
+        if self._port.phase == "waiting":
             return WARN, "waiting for a plan on scenario_plan: start the scenario", facts
-        return OK, self.phase, facts
+        return OK, self._port.phase, facts

@@ -9,22 +9,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from tdof_npid_ros.case import changeable_parameters, sample_period_in_ns
+from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.plant.lockstep import LockstepPlant
+from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.plant.realtime import RealtimePlant
 from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd
-from tdof_npid_ros.graph.runtime.messages import lane_names
 from tdof_npid_ros.graph.runtime.node import number, run_node
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters, named_model
-from tdof_npid_ros.plants.plant import Plant, PlantError
-from tdof_npid_ros.plants.simulator import PlantSimulator
-from tdof_npid_ros.wire import Sample, SignalWriter
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 FALLBACKS = ("effort", "hold")
@@ -45,23 +40,21 @@ class PlantNode(LoopEnd):
     def __init__(self) -> None:
         super().__init__("plant")
         period = self.declare_value("sample_period", 0.01, "s; time of one step", fixed=True)
-        self.period_ns = sample_period_in_ns(period)
+        period_ns = sample_period_in_ns(period)
         self.mode = self.declare_value(
             "mode", "realtime", "lockstep: wait for each answer; realtime: steady timer", fixed=True
         )
         self._declare_model()
         self._declare_options()
-        self.lossless = self.declare_value(
+        self.declare_value(
             "lossless", False, "lockstep: never run ahead of what the recorder has got; needs a recorder", fixed=True
         )
         names = self.declare_value("joint_names", [""], "name of each lane in output; none: lane0, …", fixed=True)
         self.joints = Joints([str(name) for name in names])
         self.checked({})
         self.accept_changes()
-        self.output = SignalWriter()
-        self.simulator = self.new_simulator()
-        self.simulator.warm_up()
-        self.way_of_running = MODES[self.mode](self)
+        self.port = PlantPort(self, self.model, self.model_names, period_ns, self.joints)
+        self.way_of_running = MODES[self.mode](self.port)
 
     def _declare_model(self) -> None:
         given = self.declare_value("model", "first_order", "model of the plant, or package.module:Class", fixed=True)
@@ -100,58 +93,9 @@ class PlantNode(LoopEnd):
     def activate(self) -> None:
         """Create topics, services and timers."""
         self.prepare_for_realtime()
-        qos = self.promised_qos(with_deadline=self.mode == "realtime")
-        self.output_publisher = self.publisher_of(JointState, "output", qos, matched=self.way_of_running.on_matched)
+        self.port.activate(self.mode == "realtime", self.way_of_running.on_matched)
         self.create_service(Trigger, "plant/reset", self._on_reset)
         self.way_of_running.activate()
-
-    def publish_output(self, time_ns: int) -> None:
-        """Publish what the plant puts out now, stamped with the loop's time."""
-        simulator = self.simulator
-        self.output_publisher.publish(
-            self.output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
-        )
-
-    def takes(self, topic: str, effort: np.ndarray) -> bool:
-        """Whether there is one finite value per lane; else it is refused."""
-        return self.is_valid(topic, effort, self.simulator.lanes, sys.float_info.max)
-
-    def effort_of(self, sample: Sample) -> np.ndarray | None:
-        """The control effort, (lanes,), by the joints' names where it bears them; None if it is refused."""
-        effort = sample.effort
-        if self.joints.names and set(sample.name) == set(self.joints.names):
-            effort = self.joints.selected(sample.name, effort)
-        return effort if self.takes("control_effort", effort) else None
-
-    def plant_at(self, changes: dict[str, float]) -> Plant:
-        """The plant with some parameters changed.
-
-        Raises:
-            PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
-        """
-        values = self.values_of(self.model_names)
-        changeable = changeable_parameters(self.model, values)
-        for name in changes:
-            if name not in changeable:
-                raise PlantError(
-                    f"plant.{name} cannot change while the loop runs: with model {self.model} these can: "
-                    f"{', '.join(changeable) or 'none'}"
-                )
-        return make_plant(self.model, {**values, **changes})
-
-    def new_simulator(self) -> PlantSimulator:
-        """The plant at its initial state, with the parameters as they are now."""
-        lanes = int(self.values_of(["lanes"])["lanes"])
-        return PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
-
-    def label_output(self, episode: str) -> None:
-        """What the outputs bear in `header.frame_id` from now on, beside the names of the lanes."""
-        self.output.label(episode, self.joints.names or lane_names(self.simulator.lanes))
-
-    def effort_limits(self) -> tuple[float, float]:
-        """The actuator's."""
-        p = self.values_of(["effort_min", "effort_max"])
-        return float(p["effort_min"]), float(p["effort_max"])
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = self.way_of_running.reset()
@@ -189,7 +133,7 @@ class PlantNode(LoopEnd):
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""
         level, text, facts = self.way_of_running.state()
-        return level, text, {"mode": self.mode, "lanes": self.simulator.lanes, **facts}
+        return level, text, {"mode": self.mode, "lanes": self.port.simulator.lanes, **facts}
 
 
 def main(args: list[str] | None = None) -> None:

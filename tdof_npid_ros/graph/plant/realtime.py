@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.runtime.endpoints import signal_qos
 from tdof_npid_ros.graph.runtime.loop_end import patience_ns
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
@@ -13,21 +14,18 @@ from tdof_npid_ros.graph.runtime.realtime import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
 from tdof_npid_ros.wire import Sample
 
-if TYPE_CHECKING:
-    from tdof_npid_ros.graph.plant.node import PlantNode
-
 
 class RealtimePlant:
     """Steps once per period of wall time; a tick that comes too late is counted and never made up."""
 
-    def __init__(self, node: PlantNode) -> None:
-        self._node = node
+    def __init__(self, port: PlantPort) -> None:
+        self._port, self._node = port, port.node
 
     def activate(self) -> None:
         """Create the topics and the timer."""
         node = self._node
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
-        self.wall_period_ns = max(1, round(node.period_ns / node.values_of(["speed"])["speed"]))
+        self.wall_period_ns = max(1, round(self._port.period_ns / node.values_of(["speed"])["speed"]))
         self.reset()
         node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(), sole=True)
         node.subscribe_signal("disturbance", self._on_disturbance, signal_qos(1))
@@ -35,13 +33,13 @@ class RealtimePlant:
 
     def reset(self) -> tuple[bool, str]:
         """Back to the initial state, at time 0."""
-        self._node.simulator = self._node.new_simulator()
-        self._node.label_output("")
+        port = self._port
+        port.begin(port.next_label(""), port.new_simulator())
         self._start()
         return True, "at the initial state, time 0"
 
     def _start(self) -> None:
-        lanes = self._node.simulator.lanes
+        lanes = self._port.simulator.lanes
         self.disturbance = np.zeros(lanes)
         self.failsafe = FailSafe(lanes, *self._failsafe_settings())
         self.step = 0
@@ -64,11 +62,11 @@ class RealtimePlant:
             effort = self.failsafe.effort_at(now)
             if self.failsafe.silent and not was_silent:
                 self._report_silence()
-            node.simulator.advance(effort, self.disturbance)
+            self._port.simulator.advance(effort, self.disturbance)
             node.counts["steps"] += 1
             self.step += 1
-        time_ns = self.step * node.period_ns
-        node.publish_output(time_ns)
+        time_ns = self.step * self._port.period_ns
+        self._port.publish_output(time_ns)
         self.output_ns = time_ns, now
 
     def _account_for_tick(self, now: int) -> None:
@@ -81,7 +79,7 @@ class RealtimePlant:
             self.missed_ticks = missed
 
     def _on_effort(self, sample: Sample) -> None:
-        effort = self._node.effort_of(sample)
+        effort = self._port.effort_of(sample)
         if effort is None:
             return
         now = STEADY.now().nanoseconds
@@ -98,9 +96,9 @@ class RealtimePlant:
         self._node.get_logger().error(f"no control_effort for {self._failsafe_settings()[0] / 1e9:g} s: {does}")
 
     def _on_disturbance(self, sample: Sample) -> None:
-        lanes = self._node.simulator.lanes
+        lanes = self._port.simulator.lanes
         disturbance = np.repeat(sample.effort, lanes) if len(sample.effort) == 1 else sample.effort
-        if self._node.takes("disturbance", disturbance):
+        if self._port.takes("disturbance", disturbance):
             self.disturbance = disturbance
 
     def on_matched(self, status: Any) -> None:
@@ -109,16 +107,17 @@ class RealtimePlant:
     def changed(self) -> None:
         """Take over changed parameters."""
         node = self._node
-        node.simulator.change_plant(node.plant_at({}))
-        node.simulator.effort_limits = node.effort_limits()
+        self._port.simulator.change_plant(self._port.plant_at({}))
+        self._port.simulator.effort_limits = self._port.effort_limits()
         if node.active:
             self.failsafe.change(*self._failsafe_settings())
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """As `LoopNode.state`."""
         facts: dict[str, object] = {
+            "episode": self._port.label.number,
             "state": "fallback" if self.failsafe.silent else "running",
-            "time_s": self.step * self._node.period_ns / 1e9,
+            "time_s": self.step * self._port.period_ns / 1e9,
             **self.period_error.facts("period_error"),
             **self.output_to_effort.facts("output_to_effort"),
         }

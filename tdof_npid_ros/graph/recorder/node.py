@@ -49,8 +49,12 @@ EXPECTED = {
     "disturbance": JOINT_STATE,
     "controller_state": JOINT_STATE,
     "scenario_plan": "trajectory_msgs/msg/JointTrajectory",
+    "episode": "diagnostic_msgs/msg/KeyValue",
     "/clock": "rosgraph_msgs/msg/Clock",
 }
+
+
+LATCHED = ("scenario_plan", "episode")
 
 
 class RecorderNode(LoopNode):
@@ -367,7 +371,7 @@ def _profile(qos: QoSProfile) -> QosProfile:
 
 
 def _expected_qos(name: str) -> QoSProfile:
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if name == "scenario_plan" else DurabilityPolicy.VOLATILE
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if name in LATCHED else DurabilityPolicy.VOLATILE
     return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rclpy.qos import QoSProfile
 
+from tdof_npid_ros.control.joints import all_within, fault_of
 from tdof_npid_ros.graph.runtime.endpoints import signal_qos
-from tdof_npid_ros.graph.runtime.messages import all_within
 from tdof_npid_ros.graph.runtime.node import RECENT, RECENT_QOS, LoopNode
 from tdof_npid_ros.graph.runtime.realtime import prepare_for_realtime
 
@@ -60,10 +60,7 @@ class LoopEnd(LoopNode):
 
     def is_valid(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
         """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""
-        if len(values) != lanes:
-            self.refuse("rejected", f"{topic} refused", f": it has {len(values)} values for {lanes} lanes")
-        elif not all_within(values, largest):
-            self.refuse("rejected", f"{topic} that is not finite refused")
-        else:
-            return True
-        return False
+        fault = fault_of(topic, values, lanes, largest)
+        if fault is not None:
+            self.refuse("rejected", *fault)
+        return fault is None

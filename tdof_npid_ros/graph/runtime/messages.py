@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from tdof_npid_ros.compiled import entry_point
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import SECOND
 
@@ -32,15 +30,6 @@ def time_message(time_ns: int) -> Time:
     """A stamp of a time in ns."""
     sec, nanosec = divmod(time_ns, SECOND)
     return Time(sec=sec, nanosec=nanosec)
-
-
-@entry_point
-def all_within(values: np.ndarray, largest: float) -> bool:
-    """Whether every value's magnitude is at most `largest`; that of nan is not."""
-    for value in values:  # noqa: SIM110  compiled
-        if not abs(value) <= largest:
-            return False
-    return True
 
 
 def plan_message(plan: Plan, start_ns: int) -> JointTrajectory:

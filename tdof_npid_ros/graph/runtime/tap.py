@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from tdof_npid_ros.interfaces import message_class
-from tdof_npid_ros.wire import SignalReader
+from tdof_npid_ros.wire import EpisodeLabel, SignalReader
 
 SHORTEST_PAUSE = 0.005  # s between two looks while messages come
 LONGEST_PAUSE = 0.1  # s between two looks while nothing comes; DDS keeps 5000 messages for each subscription
@@ -126,7 +126,7 @@ class LogProgress:
     """How far the log of some JointState topics is: the stamp that all of them have reached.
 
     Attributes:
-        episode: the newest outputs' `frame_id`.
+        episode: the newest outputs' label.
         stamp_ns: of the topic that is furthest behind.
     """
 
@@ -145,8 +145,8 @@ class LogProgress:
                 sample = self._readers[topic].read(data)
             except ValueError:
                 continue  # nothing that a plant or controller has published
-            episode = sample.frame_id.rpartition(" ")[2]  # an answer's begins with a digest
-            self._latest[topic] = episode, sample.stamp_ns
+            label = EpisodeLabel.named_in(sample.frame_id)
+            self._latest[topic] = str(label or ""), sample.stamp_ns
         before = self.episode, self.stamp_ns
         episodes = {episode for episode, _ in self._latest.values()}
         if len(episodes) == 1:

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from diagnostic_msgs.msg import KeyValue
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import Case
@@ -24,11 +24,10 @@ from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError
 from tdof_npid_ros.tuning.problem import TuningProblem
-from tdof_npid_ros.wire import JOINT_STATE, SignalReader
+from tdof_npid_ros.wire import JOINT_STATE, EpisodeLabel, SignalReader
 
 ATTEMPTS = 5  # at an episode that something else cuts short
 POLL = 0.1  # s between two looks at an episode's progress
-PLAN_DELAY = 0.005  # s until a plan on its way to the plant is asked for again
 TUNED_PARAMETERS = ("type", *PER_LANE)
 OUTPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL)
 
@@ -60,8 +59,10 @@ class LoopClient:
         self.plant = RemoteNode(node, f"{base}/plant", answer_timeout, check)
         self.controller = RemoteNode(node, f"{base}/controller", answer_timeout, check)
         self._outputs: EpisodeOutputs | None = None
-        self._ended = threading.Condition()
+        self._moved = threading.Condition()  # an episode has begun, or ended
+        self._episode: EpisodeLabel | None = None  # the latest that the plant has told of
         self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
+        self._episodes = node.create_subscription(KeyValue, f"{base}/episode", self._on_episode, LATCHED_QOS)
         self._tap = Tap(node, f"{base}/output", JOINT_STATE, OUTPUT_QOS)
         self._reader = SignalReader()
         self._taps = TapThread(self._tap.take, self._on_outputs)
@@ -71,6 +72,7 @@ class LoopClient:
         self._taps.stop()
         self._tap.close()
         self._node.destroy_publisher(self._plan_publisher)
+        self._node.destroy_subscription(self._episodes)
         self.plant.destroy()
         self.controller.destroy()
 
@@ -127,29 +129,36 @@ class LoopClient:
         plan = self._problem.case.plans[episode]
         outputs = EpisodeOutputs(plan.digest, self._problem.case.signals[episode], lanes)
         self._outputs = outputs
+        before = self._episode
         try:
             self._plan_publisher.publish(plan_message(plan, 0))
-            outputs.started(self._restarted_with(plan))
+            outputs.started(self._begun(plan, before))
             self._wait_for_end(outputs)
         finally:
             self._outputs = None
         return outputs
 
-    def _restarted_with(self, plan: Plan) -> int:
-        """The number of the episode that the plant starts anew, once the plan has arrived there."""
+    def _begun(self, plan: Plan, before: EpisodeLabel | None) -> EpisodeLabel:
+        """The episode that the plant has begun with the plan, once it tells."""
         end = time.monotonic() + self._answer_timeout
-        while time.monotonic() < end:
-            answer = self.plant.call(Trigger, f"{self.plant.name}/reset", Trigger.Request())
-            if answer.success and plan.digest in answer.message:
-                return int(answer.message.split()[1])
-            time.sleep(PLAN_DELAY)
-        raise LoopLostError(f"{self.plant.name} did not take the plan within {self._answer_timeout:g} s")
+        with self._moved:
+            while self._episode is None or self._episode == before or self._episode.plan != plan.digest:
+                self._moved.wait(POLL)
+                self._check()
+                if time.monotonic() > end:
+                    raise LoopLostError(f"{self.plant.name} did not begin the plan within {self._answer_timeout:g} s")
+            return self._episode
+
+    def _on_episode(self, message: KeyValue) -> None:
+        with self._moved:
+            self._episode = EpisodeLabel.parse(message.key)
+            self._moved.notify()
 
     def _wait_for_end(self, outputs: EpisodeOutputs) -> None:
         received, moved = outputs.received, time.monotonic()
-        with self._ended:
+        with self._moved:
             while not (outputs.complete or outputs.cut):
-                self._ended.wait(POLL)
+                self._moved.wait(POLL)
                 self._check()
                 now = time.monotonic()
                 if outputs.received != received:
@@ -166,10 +175,10 @@ class LoopClient:
                 output = self._reader.read(taken.data)
             except ValueError:
                 continue  # nothing that a plant has published
-            outputs.take(output.frame_id, output.stamp_ns, output.position)
+            outputs.take(EpisodeLabel.parse(output.frame_id), output.stamp_ns, output.position)
         if outputs.complete or outputs.cut:
-            with self._ended:
-                self._ended.notify()
+            with self._moved:
+                self._moved.notify()
 
     def _is_unchanged(self, gains: Gains) -> bool:
         """Whether the loop still is as it was set up, so that what was measured counts."""

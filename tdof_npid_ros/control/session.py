@@ -1,0 +1,431 @@
+"""What a controller decides about each output that arrives, and what it answers. It knows no ROS.
+
+The controller node hands every output to `Session.take`, `verify` every recorded answer to `Session.retake`; both go
+through the same decisions about where a loop begins, so what the one computed the other finds again.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from tdof_npid_ros.control.controller import Controller, rest_setpoint
+from tdof_npid_ros.control.gains import LARGEST_SIGNAL
+from tdof_npid_ros.control.joints import Joints, fault_of
+from tdof_npid_ros.scenario import Plan
+from tdof_npid_ros.wire import NO_VALUES, AnswerLabel, EpisodeLabel, Sample
+
+FAR_NS = 1_000_000_000  # a stamp that far back, or ahead of the time that has passed, is another clock's
+IN_A_ROW = 3  # outputs that do not belong to the loop, but follow each other: the loop has changed over to them
+REMEMBERED = 100  # activations of plants whose labels are known to be no new ones
+
+Decision = Literal[
+    "start",  # answered, from rest: the label is new
+    "join",  # answered, beginning within a loop that runs
+    "new",  # answered, going on
+    "same",  # answered again as before
+    "waiting",  # its plan is on the way
+    "late",  # not answered: it is older than the latest
+    "refused",  # not answered: see why
+]
+
+UNLABELLED = "output refused: it bears no label, but the loop that runs is that of a plant which labels its outputs"
+IN_LOCKSTEP = "; deactivate and activate the controller to drive something else"
+UNTIL_SILENT = "; it is taken once the plant has been silent for output_timeout"
+UNSTAMPED = "output refused: it has no stamp, but those before it have"
+NOT_STAMPED_ANEW = "output refused: it has changed, but its stamp has not"
+STAMP_IT = "; stamp each message"
+FAR_AHEAD = "output refused: its stamp is far ahead of the one before"
+OTHER_EPISODE = "output refused: it is of an episode that another has followed"
+IF_MORE_FOLLOW = f"; {IN_A_ROW} such in a row are taken"
+OUT_OF_STEP = "plant and controller differ in sample_period: give both the same"
+
+
+class Place(NamedTuple):
+    """Where an output stands: whose it is, and its stamp. `label` is None for a robot's, or anybody's."""
+
+    label: EpisodeLabel | None
+    stamp_ns: int
+
+
+class Judgement(NamedTuple):
+    """A decision; where it is `refused`, why (for the log, once) and what to do."""
+
+    decision: Decision
+    why: str = ""
+    what_to_do: str = ""
+
+
+START, JOIN, NEW = Judgement("start"), Judgement("join"), Judgement("new")
+SAME, LATE = Judgement("same"), Judgement("late")
+
+
+def is_at_beginning(place: Place) -> bool:
+    """Whether a controller that comes upon this output comes at the beginning of the episode.
+
+    In lockstep it does with the stamp 0, which only the first output of an episode has. In realtime it may have missed
+    some outputs by then.
+    """
+    return place.stamp_ns == 0 or (not (place.label and place.label.plan) and place.stamp_ns < FAR_NS)
+
+
+class OutputSequence:
+    """The outputs that one controller answers, in order: which of them begins, continues or disturbs the loop.
+
+    A loop of our plant begins with a label that is new. (A replay of it begins with the stamp 0 once more.) What the
+    controller comes upon in the middle it joins. An output that bears no label never begins anything, nor does it come
+    between the outputs of a plant that labels them.
+
+    Args:
+        sample_period_ns: of the loop.
+
+    Attributes:
+        latest: the output that was answered last; None before the first one.
+    """
+
+    def __init__(self, sample_period_ns: int) -> None:
+        self.latest: Place | None = None
+        self._far_ns = max(FAR_NS, IN_A_ROW * sample_period_ns)
+        self._known: dict[str, EpisodeLabel] = {}  # the latest label of each activation
+        self._astray: Place | None = None
+        self._in_a_row = 0
+
+    def judge(self, place: Place, silent: bool = False, elapsed_ns: int = 0) -> Judgement:
+        """Decide about an output.
+
+        Args:
+            place: the output's.
+            silent: the loop has stood still: whoever comes now may go on with it.
+            elapsed_ns: since the latest output that was answered came.
+        """
+        latest = self.latest
+        if place == latest:
+            return SAME
+        if place.label is not None and self._is_start(place):
+            return START
+        if latest is None or (silent and self._may_take_over(latest, place)):
+            return JOIN
+        if place.label != latest.label:
+            return self._of_another(latest, place)
+        if place.stamp_ns > latest.stamp_ns:
+            if place.label is not None or place.stamp_ns - latest.stamp_ns <= self._far_ns + elapsed_ns:
+                return NEW
+            return JOIN if self._follows_strays(place) else Judgement("refused", FAR_AHEAD, IF_MORE_FOLLOW)
+        if place.label is None and place.stamp_ns == 0:
+            return Judgement("refused", UNSTAMPED, STAMP_IT)
+        return JOIN if self._follows_strays(place) else LATE
+
+    def accept(self, place: Place) -> None:
+        """The output is answered: it is the latest now."""
+        self.latest = place
+        self._astray = None
+        label = place.label
+        if label is not None and self._known.get(label.activation) != label:
+            self._known[label.activation] = label
+            if len(self._known) > REMEMBERED:
+                del self._known[next(iter(self._known))]
+
+    def judge_recorded(self, place: Place, joined: bool) -> Judgement:
+        """What had been decided about an output that was answered, as the answer tells.
+
+        Args:
+            joined: the answer tells the integral action with which the controller began within a running loop.
+        """
+        latest = self.latest
+        if place == latest:
+            return SAME
+        if joined:
+            return JOIN
+        return NEW if latest is not None and self._goes_on(latest, place) else START
+
+    @staticmethod
+    def _goes_on(latest: Place, place: Place) -> bool:
+        return place.label == latest.label and place.stamp_ns > latest.stamp_ns
+
+    def _is_start(self, place: Place) -> bool:
+        label, latest = place.label, self.latest
+        assert label is not None
+        if place.stamp_ns == 0:
+            return True
+        if latest is not None and label == latest.label:
+            return False
+        if not self._known:
+            return is_at_beginning(place)
+        known = self._known.get(label.activation)
+        return known is None or label.follows(known)
+
+    @staticmethod
+    def _may_take_over(latest: Place, place: Place) -> bool:
+        return latest.label is None or place.label is not None or not latest.label.plan
+
+    def _of_another(self, latest: Place, place: Place) -> Judgement:
+        if place.label is None:
+            assert latest.label is not None
+            return Judgement("refused", UNLABELLED, IN_LOCKSTEP if latest.label.plan else UNTIL_SILENT)
+        if latest.label is None:
+            return JOIN
+        return JOIN if self._follows_strays(place) else Judgement("refused", OTHER_EPISODE, IF_MORE_FOLLOW)
+
+    def _follows_strays(self, place: Place) -> bool:
+        """Whether as many as IN_A_ROW have come one after the other, with no output of the loop between them."""
+        before, self._astray = self._astray, place
+        again = before is not None and before.label == place.label and self._later(before, place)
+        self._in_a_row = self._in_a_row + 1 if again else 1
+        return self._in_a_row >= IN_A_ROW
+
+    def _later(self, before: Place, place: Place) -> bool:
+        """Whether a stray follows another. One that waits for an answer says the same again: a plant in lockstep."""
+        repeats = place.label is not None or (self.latest is not None and place.stamp_ns > self.latest.stamp_ns)
+        return place.stamp_ns > before.stamp_ns or (repeats and place.stamp_ns == before.stamp_ns)
+
+
+_FINE = ("", "")
+
+
+class Answer(NamedTuple):
+    """What a controller answers to an output.
+
+    Attributes:
+        stamp_ns: of the output.
+        label: the parameters that it was computed with, and the output's episode.
+        setpoint, effort: (lanes,).
+        began_with: the integral action, (lanes,), of an answer with which the controller began within a running loop;
+            else empty.
+    """
+
+    stamp_ns: int
+    label: AnswerLabel
+    setpoint: np.ndarray
+    effort: np.ndarray
+    began_with: np.ndarray
+
+
+class Outcome(NamedTuple):
+    """What became of an output.
+
+    Attributes:
+        decision: see there.
+        answer: None if it is not answered.
+        why: it was refused, or, of an answered one, what is wrong all the same; for the log, once.
+        detail: for the log after it: figures, or what to do.
+        after_silence: the loop had fallen silent before it.
+    """
+
+    decision: Decision
+    answer: Answer | None
+    why: str = ""
+    detail: str = ""
+    after_silence: bool = False
+
+
+class Session:
+    """One controller in one loop, from its activation to its end.
+
+    Args:
+        controller: computes the answers.
+        joints: which elements of the outputs are its lanes.
+
+    Attributes:
+        plan: the latest that has come; the setpoint of outputs that bear its digest.
+        setpoint: of all others, (1,) or (lanes,).
+        holds_output: the setpoint is the first output, until another is given.
+        timeout_ns: without an output for so long, a loop in realtime counts as silent; 0: never.
+        saved_integral: the integral action to join a loop with, (lanes,); None: the one that leaves the effort.
+        waiting: an output whose plan has not come.
+        silent: no output comes; the next one is joined.
+        is_out_of_step: the plant in lockstep has another sample period.
+    """
+
+    def __init__(self, controller: Controller, joints: Joints) -> None:
+        self.controller = controller
+        self.joints = joints
+        self.plan: Plan | None = None
+        self.setpoint = np.zeros(1)
+        self.holds_output = False
+        self.timeout_ns = 0
+        self.saved_integral: np.ndarray | None = None
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the loop: the next output is the first one."""
+        self.controller.reset()
+        self.sequence = OutputSequence(self.controller.sample_period_ns)
+        self.waiting: Sample | None = None
+        self.silent = self.is_out_of_step = False
+        self.answer: Answer | None = None
+        self._answered = NO_VALUES  # the latest output that was
+        self._arrival_ns: int | None = None
+        self._common = np.zeros(self.controller.lanes)
+
+    @property
+    def label(self) -> EpisodeLabel | None:
+        """Of the latest output that was answered; None for a robot's, and before the first."""
+        return self.sequence.latest and self.sequence.latest.label
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Of the latest output that was answered."""
+        return self.sequence.latest and self.sequence.latest.stamp_ns
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the loop goes on without waiting for answers: in realtime, and on a robot."""
+        return self.sequence.latest is not None and not (self.label and self.label.plan)
+
+    def set_setpoint(self, setpoint: np.ndarray) -> None:
+        """Take this setpoint, (1,) or (lanes,), for outputs without a plan."""
+        self.setpoint, self.holds_output = setpoint, False
+
+    # In the loop
+
+    def take(self, output: Sample, now_ns: int) -> Outcome:
+        """Decide about an output, and answer it.
+
+        Args:
+            now_ns: when it came, on a clock that is never set.
+        """
+        try:
+            y = self.joints.selected(output.name, output.position)
+        except ValueError as error:
+            return Outcome("refused", None, "output refused", f": it {error}")
+        if (fault := fault_of("output", y, self.controller.lanes, LARGEST_SIGNAL)) is not None:
+            return Outcome("refused", None, *fault)
+        place = Place(EpisodeLabel.parse(output.frame_id), output.stamp_ns)
+        self.waiting = None
+        setpoint = self._setpoint_at(place)
+        if setpoint is None:
+            self.waiting = output
+            return Outcome("waiting", None)
+        elapsed_ns = 0 if self._arrival_ns is None else now_ns - self._arrival_ns
+        silent = self.is_live and 0 < self.timeout_ns < elapsed_ns
+        decision, why, detail = self.sequence.judge(place, silent, elapsed_ns)
+        if decision == "same":
+            if place.label is None and y.tobytes() != self._answered.tobytes():
+                return Outcome("refused", None, NOT_STAMPED_ANEW, STAMP_IT)
+            return Outcome("same", self.answer)
+        if decision in ("late", "refused"):
+            return Outcome(decision, None, why, detail)
+        if decision == "new" and place.label is not None and place.label.plan:
+            why, detail = self._compare_periods(place)
+        if self.holds_output and not (place.label and place.label.plan):
+            self.set_setpoint(y)
+            setpoint = self._live_setpoint()
+        self._answered, self._arrival_ns, self.silent = y, now_ns, False
+        applied = self._applied(output) if decision in ("join", "start") else None
+        self._proceed(decision, place, setpoint, y, applied, self._take_saved(decision))
+        return Outcome(decision, self.answer, why, detail, silent)
+
+    def _compare_periods(self, place: Place) -> tuple[str, str]:
+        """In lockstep outputs come every sample period; if not, plant and controller were given different ones."""
+        assert self.stamp_ns is not None
+        apart_ns, period_ns = place.stamp_ns - self.stamp_ns, self.controller.sample_period_ns
+        self.is_out_of_step = apart_ns != period_ns
+        return (
+            (OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s") if self.is_out_of_step else _FINE
+        )
+
+    def look_for_silence(self, now_ns: int) -> bool:
+        """Whether the loop in realtime has just fallen silent."""
+        if self.silent or not self.is_live or not self.timeout_ns or self._arrival_ns is None:
+            return False
+        self.silent = now_ns - self._arrival_ns > self.timeout_ns
+        return self.silent
+
+    def _setpoint_at(self, place: Place) -> np.ndarray | None:
+        """The setpoint for an output, (lanes,); None if its plan has not come."""
+        label = place.label
+        if label is None or not label.plan:
+            return self._live_setpoint()
+        if self.plan is None or self.plan.digest != label.plan:
+            return None
+        return self._on_every_lane(self.plan.value_at("setpoint", place.stamp_ns))
+
+    def _live_setpoint(self) -> np.ndarray:
+        return self.setpoint if len(self.setpoint) > 1 else self._on_every_lane(self.setpoint[0])
+
+    def _on_every_lane(self, setpoint: float) -> np.ndarray:
+        """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
+        if setpoint != self._common[0] or len(self._common) != self.controller.lanes:
+            self._common = np.full(self.controller.lanes, setpoint)
+        return self._common
+
+    def _applied(self, output: Sample) -> np.ndarray | None:
+        """The effort that the output reports, (lanes,); None if it reports none."""
+        try:
+            applied = self.joints.selected(output.name, output.effort)
+        except ValueError:
+            return None
+        return applied if len(applied) == self.controller.lanes and np.isfinite(applied).all() else None
+
+    def _take_saved(self, decision: Decision) -> np.ndarray | None:
+        if decision not in ("join", "start"):
+            return None
+        saved, self.saved_integral = self.saved_integral, None
+        return saved if saved is not None and len(saved) == self.controller.lanes else None
+
+    # From a bag
+
+    def retake(
+        self,
+        place: Place,
+        setpoint: np.ndarray,
+        output: np.ndarray,
+        applied: np.ndarray | None,
+        integral: np.ndarray | None,
+    ) -> Judgement:
+        """Answer an output as it was answered before: the answer is in `answer`.
+
+        Args:
+            setpoint, output: (lanes,).
+            applied: the effort that the output reports; None if it reports none.
+            integral: that the recorded answer tells, of a controller that began within a running loop; else None.
+        """
+        judgement = self.sequence.judge_recorded(place, integral is not None)
+        self._proceed(judgement.decision, place, setpoint, output, applied, integral)
+        return judgement
+
+    def pass_over(self, place: Place) -> None:
+        """An output was answered, but the answer cannot be computed again."""
+        self.sequence.accept(place)
+
+    # Both
+
+    def _proceed(
+        self,
+        decision: Decision,
+        place: Place,
+        setpoint: np.ndarray,
+        output: np.ndarray,
+        applied: np.ndarray | None,
+        integral: np.ndarray | None,
+    ) -> None:
+        """Begin if it is decided, and answer."""
+        controller = self.controller
+        if decision == "start":
+            self._start(place, output, applied)
+        elif decision == "join":
+            self._join(applied, integral)
+        self.sequence.accept(place)
+        effort = controller.answer(place.stamp_ns, setpoint, output)
+        began_with = controller.integral_before if decision == "join" else NO_VALUES
+        self.answer = Answer(place.stamp_ns, AnswerLabel(controller.digest, place.label), setpoint, effort, began_with)
+
+    def _start(self, place: Place, output: np.ndarray, applied: np.ndarray | None) -> None:
+        """Begin from rest: settled where the plant rests, or from nothing."""
+        self.controller.reset()
+        if place.label is None or not place.label.activation or applied is None:
+            return  # in recordings of before, every loop began from nothing, a robot's too
+        plan = self.plan if self.plan is not None and self.plan.digest == place.label.plan else None
+        rest = rest_setpoint(plan.start if plan else None, output, applied)
+        if rest is not None:
+            self.controller.begin_at_rest(applied, rest)
+
+    def _join(self, applied: np.ndarray | None, integral: np.ndarray | None) -> None:
+        """Begin within a running loop: with the effort reported, or our own latest, or with no integral action."""
+        if applied is None and self.answer is not None:
+            applied = self.controller.effort.copy()
+        if applied is None:
+            applied = np.zeros(self.controller.lanes)
+            integral = applied if integral is None else integral
+        self.controller.begin_within(applied, integral)

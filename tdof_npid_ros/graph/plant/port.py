@@ -1,0 +1,132 @@
+"""The simulated plant at its topics: what both ways of running it see of the node."""
+
+from __future__ import annotations
+
+import secrets
+import sys
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from diagnostic_msgs.msg import KeyValue
+from sensor_msgs.msg import JointState
+
+from tdof_npid_ros.case import changeable_parameters
+from tdof_npid_ros.control.joints import Joints
+from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
+from tdof_npid_ros.graph.runtime.messages import lane_names
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.plant import Plant, PlantError
+from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
+
+EPISODE = "episode"  # the topic
+Phase = Literal["waiting", "running", "stopped", "finished"]
+
+
+class PlantPort:
+    """The plant with its output and its efforts, and the label of what it does.
+
+    Args:
+        node: declares the plant's parameters; through it everything goes.
+        model: of the plant.
+        model_names: names of its parameters.
+        period_ns: the sample period.
+        joints: the lanes' names.
+
+    Attributes:
+        simulator: the plant as it is now.
+        label: of the episode; its number is 0 before the first one of an activation.
+        phase: of the episode.
+    """
+
+    def __init__(self, node: LoopEnd, model: str, model_names: list[str], period_ns: int, joints: Joints) -> None:
+        self.node = node
+        self.period_ns = period_ns
+        self.joints = joints
+        self._model, self._model_names = model, model_names
+        self._output = SignalWriter()
+        self.phase: Phase = "waiting"
+        self.label = EpisodeLabel("", "", 0)
+        self.simulator = self.new_simulator()
+        self.simulator.warm_up()
+
+    def activate(self, with_deadline: bool, matched: Callable[[Any], None]) -> None:
+        """Create the topics `output` and `episode`, and wait.
+
+        Args:
+            with_deadline: whether `output` promises one.
+            matched: told of each subscriber of `output` that comes or goes.
+        """
+        node = self.node
+        qos = node.promised_qos(with_deadline=with_deadline)
+        self._output_publisher = node.publisher_of(JointState, "output", qos, matched=matched)
+        self._episode_publisher = node.create_publisher(KeyValue, EPISODE, LATCHED_QOS)
+        self.label = EpisodeLabel("", secrets.token_hex(4), 0)
+        self.tell("waiting")
+
+    # Episodes
+
+    def next_label(self, plan: str) -> EpisodeLabel:
+        """Of the episode that would begin now; `plan` is the digest of its plan, empty where there is none."""
+        return EpisodeLabel(plan, self.label.activation, self.label.number + 1)
+
+    def begin(self, label: EpisodeLabel, simulator: PlantSimulator) -> None:
+        """Begin an episode: outputs are those of this simulator, and bear this label, from now on."""
+        self.label, self.simulator = label, simulator
+        self._output.label(str(label), self.joints.names or lane_names(simulator.lanes))
+        self.tell("running")
+
+    def tell(self, phase: Phase) -> None:
+        """Say on `episode` how it stands with the episode."""
+        self.phase = phase
+        self._episode_publisher.publish(KeyValue(key=str(self.label), value=phase))
+
+    # Signals
+
+    def publish_output(self, time_ns: int) -> None:
+        """Publish what the plant puts out now, stamped with the loop's time."""
+        simulator = self.simulator
+        self._output_publisher.publish(
+            self._output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
+        )
+
+    def takes(self, topic: str, effort: np.ndarray) -> bool:
+        """Whether there is one finite value per lane; else it is refused."""
+        return self.node.is_valid(topic, effort, self.simulator.lanes, sys.float_info.max)
+
+    def effort_of(self, sample: Sample) -> np.ndarray | None:
+        """The control effort, (lanes,), by the joints' names where it bears them; None if it is refused."""
+        effort = sample.effort
+        if self.joints.names and set(sample.name) == set(self.joints.names):
+            effort = self.joints.selected(sample.name, effort)
+        return effort if self.takes("control_effort", effort) else None
+
+    # The plant
+
+    def plant_at(self, changes: dict[str, float]) -> Plant:
+        """The plant with some parameters changed.
+
+        Raises:
+            PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
+        """
+        values = self.node.values_of(self._model_names)
+        changeable = changeable_parameters(self._model, values)
+        for name in changes:
+            if name not in changeable:
+                raise PlantError(
+                    f"plant.{name} cannot change while the loop runs: with model {self._model} these can: "
+                    f"{', '.join(changeable) or 'none'}"
+                )
+        return make_plant(self._model, {**values, **changes})
+
+    def new_simulator(self) -> PlantSimulator:
+        """The plant at its initial state, with the parameters as they are now."""
+        lanes = int(self.node.values_of(["lanes"])["lanes"])
+        return PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
+
+    def effort_limits(self) -> tuple[float, float]:
+        """The actuator's."""
+        p = self.node.values_of(["effort_min", "effort_max"])
+        return float(p["effort_min"]), float(p["effort_max"])
