@@ -39,29 +39,33 @@ def draw(episodes: Sequence[Named], path: Path, legend: Mapping[str, str]) -> No
     """
     kinds = list(grouped(episodes).items())
     bags = bag_names(episode.bag for _, episode in episodes)
-    panels = [
-        Panel(
-            group,
-            [
-                Curve(
-                    legend.get(name) or label(name if len(members) > 1 else "", episode, lane, bags[episode.bag]),
-                    episode.time,
-                    episode.output[:, lane],
-                    episode.control_effort[:, lane],
-                    episode.setpoint[:, lane],
-                    episode.disturbance,
-                )
-                for name, episode in members
-                for lane in range(min(episode.lanes, MOST_LANES))
-            ],
-            limits(members),
-        )
-        for group, members in kinds[:MOST_COLUMNS]
-    ]
+    panels = [panel(group, members, bags, legend) for group, members in kinds[:MOST_COLUMNS]]
     more = len(kinds) - len(panels)
     draw_responses(
         panels, path, title=f"{more} more kinds of episodes are not shown here: --html shows all" if more else ""
     )
+
+
+def panel(group: str, members: Sequence[Named], bags: Mapping[str, str], legend: Mapping[str, str]) -> Panel:
+    """What there is to draw of the episodes of one kind.
+
+    Args:
+        bags: what a bag is called in a legend, by its path.
+        legend: what the curves of some episodes are called, by the episodes' names.
+    """
+    curves = [
+        Curve(
+            legend.get(name) or label(name if len(members) > 1 else "", episode, lane, bags[episode.bag]),
+            episode.time,
+            episode.output[:, lane],
+            episode.control_effort[:, lane],
+            episode.setpoint[:, lane],
+            episode.disturbance,
+        )
+        for name, episode in members
+        for lane in range(min(episode.lanes, MOST_LANES))
+    ]
+    return Panel(group, curves, limits(members))
 
 
 def limits(members: Sequence[Named]) -> tuple[float, float]:

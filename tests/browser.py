@@ -1,0 +1,39 @@
+"""A page in a real headless Chromium, for the tests: nothing may be fetched from elsewhere, nothing complained of."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+           "--disable-component-update", "--disable-sync"]  # fmt: skip
+
+
+@contextmanager
+def chromium_page(program: str, width: int = 1280, height: int = 900, **context: Any) -> Iterator[Any]:
+    """A Playwright page; at its end, errors in its console and requests beyond this machine fail the test."""
+    from playwright.sync_api import sync_playwright
+
+    troubles: list[str] = []
+    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as profile:
+        browser = playwright.chromium.launch_persistent_context(
+            profile,
+            executable_path=program,
+            headless=True,
+            args=OPTIONS,
+            viewport={"width": width, "height": height},
+            **context,
+        )
+        page = browser.new_page()
+        page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda request: _is_foreign(request.url) and troubles.append(f"fetched {request.url}"))
+        yield page
+        browser.close()
+    assert not troubles, troubles
+
+
+def _is_foreign(url: str) -> bool:
+    return not url.startswith(("file:", "data:", "blob:", "about:", "http://127.0.0.1", "ws://127.0.0.1"))
