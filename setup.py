@@ -32,6 +32,7 @@ TEST = [
     "pytest>=8",
     "pytest-timeout",
     "pytest-xdist",
+    "control>=0.10,<0.11",
     "hypothesis",
     "ruff",
     "mypy",

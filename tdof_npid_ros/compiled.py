@@ -37,6 +37,11 @@ def compiled(function: F) -> F:
     return cast(F, numba.njit(error_model="numpy", nogil=True, forceinline=True)(function))
 
 
+def called(function: F) -> F:
+    """Compile a function that compiled functions call: for what is large and rarely needed, so that it exists once."""
+    return cast(F, numba.njit(error_model="numpy", nogil=True)(function))
+
+
 def _fused_multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, rounded once. Written out where it is wanted, so that every processor gives the same bits."""
     signature = types.float64(types.float64, types.float64, types.float64)

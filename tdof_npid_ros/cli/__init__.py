@@ -18,6 +18,7 @@ SUBCOMMANDS = {
     "check": "look at a parameter file as an experienced colleague would",
     "demo": "run the paper's first process over ROS 2, end to end",
     "simulate": "run a case in process and print its metrics",
+    "margins": "how far a loop is from instability: M_s, gain, phase and delay margin, slowest mode",
     "tune": "find the gains of a case with the hybrid genetic algorithm",
     "pareto": "the trade-off between tracking and rejection (the paper's Figure 6)",
     "reproduce": "every table and figure of the paper, published beside ours",

@@ -1,9 +1,10 @@
-"""The arguments that say which gains a subcommand runs with."""
+"""Which gains a subcommand runs with: its arguments, and what it says of them."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from tdof_npid_ros.case import Case, controller_type
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, Gains, gains_from_mapping
@@ -56,3 +57,18 @@ def gains_by_source(case: Case, kind: str | None, source: str | None) -> Gains:
             f"there are no {source} gains for {type_} on {case.name}: give --gains FILE, or --kp …"
         )
     return case.gains.with_values(type=type_, **{name: getattr(row.gains, name) for name in PER_LANE})
+
+
+def loop_report(case: Case, gains: Gains) -> dict[str, Any]:
+    """What a report on a loop begins with."""
+    return {
+        "case": case.name,
+        "controller": gains.type,
+        "gains": {name: getattr(gains, name) for name in PER_LANE},
+    }
+
+
+def headline(case: Case, gains: Gains) -> str:
+    """The same, in one line for people."""
+    shown = "  ".join(f"{name} {getattr(gains, name):g}" for name in PER_LANE)
+    return f"{case.name}  {gains.type}  {shown}"

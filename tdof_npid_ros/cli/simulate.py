@@ -15,11 +15,12 @@ import numpy as np
 
 from tdof_npid_ros.advice import gravest
 from tdof_npid_ros.case import Case, find_parameter_file, load_case
-from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains
-from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
+from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
 from tdof_npid_ros.loop import Trajectory
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.plotting import Curve, Panel, draw_responses
+from tdof_npid_ros.stability.margins import margins
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,13 +37,15 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the metrics of the case's setpoint and disturbance episodes."""
+    """Print the metrics of the case's setpoint and disturbance episodes, and the margins."""
     check_outputs([path for path in (arguments.plot, arguments.csv) if path], [find_parameter_file(arguments.case)])
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
-    report = response_report(case, gains) | advised(case, gains)
+    found = margins(case, gains)
+    report = response_report(case, gains) | {"margins": found.as_dict()} | advised(case, gains)
     write_responses(case, {title(gains): gains}, arguments)
-    print(json.dumps(report) if arguments.json else _table(report))
+    lines = [headline(case, gains), *_table(report), *(f"  margins      {line}" for line in found.lines())]
+    print(json.dumps(report) if arguments.json else "\n".join(lines))
     return 0
 
 
@@ -86,9 +89,7 @@ def response_report(case: Case, gains: Gains) -> dict[str, Any]:
     """Metrics of both episodes and the objective (10), as the contract's JSON object."""
     setpoint, disturbance = case.setpoint_response(gains), case.disturbance_response(gains)
     return {
-        "case": case.name,
-        "controller": gains.type,
-        "gains": {name: getattr(gains, name) for name in PER_LANE},
+        **loop_report(case, gains),
         "setpoint": _without_empty_reason(asdict(setpoint)),
         "disturbance": _without_empty_reason(asdict(disturbance)),
         "objective": setpoint.iae + case.weight * disturbance.iae,
@@ -108,14 +109,13 @@ def _without_empty_reason(metrics: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in metrics.items() if name != "reason" or value is not None}
 
 
-def _table(report: dict[str, Any]) -> str:
-    gains = "  ".join(f"{name} {value:g}" for name, value in report["gains"].items())
-    lines = [f"{report['case']}  {report['controller']}  {gains}"]
+def _table(report: dict[str, Any]) -> list[str]:
+    lines = []
     for episode in ("setpoint", "disturbance"):
         for name, value in report[episode].items():
             shown = value if isinstance(value, str) else "-" if value is None else _number(value)
             lines.append(f"  {episode:12} {name:18} {shown}")
-    return "\n".join([*lines, f"  objective {_number(report['objective'])}"])
+    return [*lines, f"  objective {_number(report['objective'])}"]
 
 
 def _number(value: float) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from tdof_npid_ros.plants.ode import Ode, Sprott
 
 STEP = 1e-6  # of a central difference, relative to the size of what is varied; errors of order 1e-10
+KINK = 1e-2  # part by which the slopes on the two sides may differ where there is none
 
 
 class LinearModel(NamedTuple):
@@ -20,8 +21,8 @@ class LinearModel(NamedTuple):
     c: np.ndarray
 
 
-def linearised(plant: Ode | Sprott) -> LinearModel:
-    """The linear model of a plant where it begins (`plant.at_rest(y)` begins at rest).
+def linearised(plant: Ode | Sprott, disturbance: float = 0.0) -> LinearModel:
+    """The linear model of a plant where it begins (`plant.at_rest(y, d)` begins at rest).
 
     Where the right-hand side has a kink or a jump there (the circuit's sign at y = 0), it is a secant's slope.
 
@@ -29,27 +30,52 @@ def linearised(plant: Ode | Sprott) -> LinearModel:
         >>> [round(value, 6) for value in linearised(Sprott().at_rest(1.0)).a[2].tolist()]  # -b, -1, -a
         [-1.2, -1.0, -0.6]
     """
-    x, u = np.array(plant.initial_state), plant.initial_effort
-
-    def slope(state: np.ndarray, effort: float, disturbance: float) -> np.ndarray:
-        return np.array(plant.derivative(tuple(map(float, state)), effort, disturbance))
-
-    def column(i: int) -> np.ndarray:
-        step = np.zeros(len(x))
-        step[i] = STEP * max(1.0, abs(x[i]))
-        return np.asarray((slope(x + step, u, 0.0) - slope(x - step, u, 0.0)) / (2.0 * step[i]))
-
-    def seen(i: int) -> float:
-        step = np.zeros(len(x))
-        step[i] = STEP * max(1.0, abs(x[i]))
-        above, below = (plant.output(tuple(map(float, x + sign * step))) for sign in (1.0, -1.0))
-        return float((above - below) / (2.0 * step[i]))
-
-    states = range(len(x))
-    h = STEP * max(1.0, abs(u))
+    states, values = _varied(plant, disturbance)
+    slopes = [(above - below) / (2.0 * step) for below, _, above, step in values]
+    n = len(states)
     return LinearModel(
-        np.stack([column(i) for i in states], axis=1),
-        (slope(x, u + h, 0.0) - slope(x, u - h, 0.0)) / (2.0 * h),
-        (slope(x, u, STEP) - slope(x, u, -STEP)) / (2.0 * STEP),
-        np.array([seen(i) for i in states]),
+        np.stack([slope[:n] for slope in slopes[:n]], axis=1),
+        slopes[n][:n],
+        slopes[n + 1][:n],
+        np.array([slope[n] for slope in slopes[:n]]),
     )
+
+
+def has_kink(plant: Ode | Sprott, disturbance: float = 0.0) -> bool:
+    """Whether the slopes on the two sides of where a plant begins differ: there it has no linear model.
+
+    Example:
+        >>> has_kink(Sprott().at_rest(0.0)), has_kink(Sprott().at_rest(1.0))
+        (True, False)
+    """
+    _, values = _varied(plant, disturbance)
+    _, wider = _varied(plant, disturbance, 2.0 * STEP)
+
+    def differ(one: np.ndarray, other: np.ndarray, step: float) -> bool:
+        return bool(np.any(np.abs(one - other) > KINK * (np.abs(one) + np.abs(other)) + step * STEP))
+
+    return any(
+        differ(above - here, here - below, step) or differ(2.0 * (above - below), far_above - far_below, step)
+        for (below, here, above, step), (far_below, _, far_above, _) in zip(values, wider, strict=True)
+    )
+
+
+_Values = list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]
+
+
+def _varied(plant: Ode | Sprott, disturbance: float, relative: float = STEP) -> tuple[np.ndarray, _Values]:
+    """The state at the start; and dx/dt and y, (states + 1,), below, at and above it, with the step, for each of the
+    states, the effort and the disturbance."""
+    start = np.array([*plant.initial_state, plant.initial_effort, disturbance])
+    states = len(start) - 2
+
+    def at(point: np.ndarray) -> np.ndarray:
+        x = tuple(map(float, point[:states]))
+        return np.array([*plant.derivative(x, float(point[-2]), float(point[-1])), plant.output(x)])
+
+    def around(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        step = np.zeros(len(start))
+        step[i] = relative * max(1.0, abs(start[i]))
+        return at(start - step), at(start), at(start + step), float(step[i])
+
+    return start[:states], [around(i) for i in range(len(start))]

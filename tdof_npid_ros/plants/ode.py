@@ -59,11 +59,11 @@ class Sprott:
         """y in the state x."""
         return x[0]
 
-    def at_rest(self, output: float) -> Sprott:
-        """The same circuit, beginning at rest with this output: x2 = 0, x3 = -u = (c sgn(y) - b y)/a."""
+    def at_rest(self, output: float, disturbance: float = 0.0) -> Sprott:
+        """The same circuit, beginning at rest with this output: x2 = 0, x3 = -u = (c sgn(y) - b y + d)/a."""
         if self.a == 0.0:
             raise PlantError(f"no effort holds the output at {output:g}: a is 0")
-        third = (math.copysign(self.c, output) * (output != 0.0) - self.b * output) / self.a
+        third = (math.copysign(self.c, output) * (output != 0.0) - self.b * output + disturbance) / self.a
         return replace(self, initial_state=(output, 0.0, third), initial_effort=-third)
 
     def sampled(self, sample_period_ns: int) -> SampledSprott:
@@ -111,9 +111,9 @@ class Ode:
         """y in the state x."""
         return float(self._output(x, self.values))
 
-    def at_rest(self, output: float) -> Ode:
+    def at_rest(self, output: float, disturbance: float = 0.0) -> Ode:
         """The same plant, beginning where dx/dt = 0 with this output; found numerically from `initial_state`."""
-        state, effort = _resting(self, output)
+        state, effort = _resting(self, output, disturbance)
         resting = copy.copy(self)
         resting.initial_state, resting.initial_effort = state, effort
         return resting
@@ -144,7 +144,7 @@ class Ode:
             raise PlantError(f"{name}: in its initial state dx/dt is {slope!r} and y is {y!r}: they must be finite")
 
 
-def _resting(plant: Ode, wanted: float) -> tuple[State, float]:
+def _resting(plant: Ode, wanted: float, disturbance: float) -> tuple[State, float]:
     """State and effort with dx/dt = 0 and output `wanted`; to 12 digits, so that they are the same on every machine.
 
     Raises:
@@ -154,7 +154,7 @@ def _resting(plant: Ode, wanted: float) -> tuple[State, float]:
 
     def unbalanced(unknown: np.ndarray) -> list[float]:
         x = tuple(map(float, unknown[:-1]))
-        return [*plant.derivative(x, float(unknown[-1]), 0.0), plant.output(x) - wanted]
+        return [*plant.derivative(x, float(unknown[-1]), disturbance), plant.output(x) - wanted]
 
     best = math.inf
     for effort in (0.0, 1.0, wanted, -1.0):

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.compiled import called, compiled, entry_point
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import KD_H, KI_H, KP, PHI, coefficients
 from tdof_npid_ros.stability import StabilityError
@@ -219,7 +219,7 @@ def _loop_at(a: Any, b: Any, w: Any, c: Any) -> Any:
     return b * (v * (kp * s + kd_h * w) + ki_h * s), a * v * s
 
 
-@compiled
+@called
 def _loop_at_frequency(response: Any, omega: Any, c: Any) -> Any:
     half = math.sin(0.5 * omega)
     w = complex(-2.0 * half * half, math.sin(omega))
@@ -228,14 +228,14 @@ def _loop_at_frequency(response: Any, omega: Any, c: Any) -> Any:
     return _loop_at(a, b * complex(math.cos(angle), -math.sin(angle)), w, c)
 
 
-@compiled
+@called
 def _inverse(response: Any, omega: Any, c: Any, of_t: Any) -> Any:
     """1/|S|², or 1/|T|²."""
     n, d = _loop_at_frequency(response, omega, c)
     return _squared(n + d) / _squared(n if of_t else d)
 
 
-@compiled
+@called
 def _peak(response: Any, low: Any, middle: Any, high: Any, c: Any, of_t: Any) -> Any:
     """The largest |S|² or |T|² between two frequencies, and where.
 
@@ -275,7 +275,7 @@ def _peak(response: Any, low: Any, middle: Any, high: Any, c: Any, of_t: Any) ->
     return 1.0 / f, x
 
 
-@compiled
+@called
 def _half_turns(response: Any, c: Any, low: Any, p: Any, high: Any, q: Any) -> Any:
     """How often χ crosses the real axis between two frequencies, counter-clockwise positive; and if that is sure.
 
@@ -333,7 +333,7 @@ def _nearest_of(p: Any, q: Any, r: Any) -> Any:
     return min(_nearest(p, q), _nearest(q, r))
 
 
-@compiled
+@called
 def _keep(estimate: Any, index: Any, best: Any, where: Any) -> None:
     """Enter a peak into the list of the highest."""
     i = _SEGMENTS - 1
@@ -345,7 +345,7 @@ def _keep(estimate: Any, index: Any, best: Any, where: Any) -> None:
     best[i], where[i] = estimate, index
 
 
-@compiled
+@called
 def _mode(response: Any, w: Any, c: Any, found: Any, count: Any) -> Any:
     """A zero of χ near w by Laguerre's method, those already found divided out; nan if it does not converge."""
     kp, ki_h, kd_h, s0, s1, v0, v1 = c
@@ -390,7 +390,7 @@ def _mode(response: Any, w: Any, c: Any, found: Any, count: Any) -> Any:
     return complex(np.nan, np.nan)
 
 
-@compiled
+@called
 def _slowest(response: Any, starts: Any, c: Any, found: Any) -> Any:
     """The largest modulus of the modes that lie next to the starting points, frequencies; 0 stands for z = 1."""
     largest = 0.0
@@ -417,7 +417,7 @@ def _angle(x: Any) -> Any:
     return math.atan2(x.imag, x.real)
 
 
-@compiled
+@called
 def _crossover(response: Any, c: Any, margins: Any, lane: Any, low: Any, before: Any, high: Any, after: Any) -> None:
     """Take the margins of what L, known at two frequencies, crosses: the negative real axis, and the unit circle."""
     angle, turn, growth = _angle(before), _angle(after * before.conjugate()), _growth(before, after)
@@ -453,7 +453,7 @@ def _loop_between(response: Any, c: Any, low: Any, high: Any, part: Any) -> Any:
     return _quotient(n, d)
 
 
-@compiled
+@called
 def _gain(margins: Any, lane: Any, size: Any) -> None:
     """Take the gain margin of L = -size."""
     if size <= 1.0:
@@ -487,7 +487,8 @@ def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, modes_
         n, d = _loop_at(complex(response.a_polynomial[0]), complex(response.b_polynomial[0]), 0j, c)
         before = n + d
         if before.real == 0.0:
-            continue  # a mode at z = 1
+            margins[_STABLE + 1 :, lane] = np.nan  # a mode at z = 1
+            continue
         sign = 1.0 if before.real > 0.0 else -1.0
         if d.real != 0.0 and n.real / d.real < 0.0:
             _gain(margins, lane, -n.real / d.real)

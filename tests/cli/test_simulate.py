@@ -22,7 +22,7 @@ def simulated(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, 
 
 def test_json_has_the_keys_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
     report = simulated(capsys, "p1-c4", "--controller", "pid", "--gains", "published")
-    assert set(report) == {"case", "controller", "gains", "setpoint", "disturbance", "objective"}
+    assert set(report) == {"case", "controller", "gains", "setpoint", "disturbance", "objective", "margins"}
     assert set(report["gains"]) == {"kp", "ki", "kd", "alpha", "beta", "sigma"}  # type: ignore[arg-type]
     assert {"overshoot_percent", "settling_time_s", "iae"} <= set(report["setpoint"])  # type: ignore[arg-type]
     assert {"peak", "recovery_time_s", "iae"} <= set(report["disturbance"])  # type: ignore[arg-type]
@@ -228,7 +228,7 @@ def test_every_case_and_type_prints_the_contract_s_object(
         return
     assert main(arguments) == 0
     report = json.loads(capsys.readouterr().out)
-    assert list(report) == ["case", "controller", "gains", "setpoint", "disturbance", "objective"]
+    assert list(report) == ["case", "controller", "gains", "setpoint", "disturbance", "objective", "margins"]
     assert (report["case"], report["controller"]) == (case, controller)
     assert list(report["gains"]) == ["kp", "ki", "kd", "alpha", "beta", "sigma"]
     assert list(report["setpoint"])[:3] == ["overshoot_percent", "settling_time_s", "iae"]
