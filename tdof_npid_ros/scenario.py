@@ -24,15 +24,20 @@ from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from tdof_npid_ros.control.gains import LARGEST_SIGNAL
+from tdof_npid_ros.one_line import one_line
 
 SIGNALS = ("setpoint", "disturbance")
+PLANT = "plant."  # before the names of the plant's parameters
 START = "start"  # the column of a plan that begins at rest; its value is the same at each point
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
+LONGEST_TIME = 1e9  # s, thirty years: of a plan and of whatever lasts in it
+MOST_VALUES = 300_000  # points times signals, as many as ramps over five minutes at 1 ms make: a plan is one message
 GRAMMAR = (
     "TIME setpoint|disturbance|plant.NAME VALUE, TIME SIGNAL ramp VALUE over SECONDS, "
     "TIME SIGNAL sine AMPLITUDE period SECONDS for SECONDS, 0 start VALUE, or TIME end"
@@ -99,12 +104,13 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in self.names:
-            if name not in (*SIGNALS, START) and not (name.startswith("plant.") and len(name) > len("plant.")):
+            if name not in (*SIGNALS, START) and not (name.startswith(PLANT) and len(name) > len(PLANT)):
                 raise PlanError(f"unknown signal {name!r}: a plan drives setpoint, disturbance and plant.<parameter>")
         if len(set(self.names)) != len(self.names):
             raise PlanError(f"a signal is named twice in {', '.join(self.names)}")
         if len(self.times_ns) < 2 or len(self.times_ns) != len(self.values):
             raise PlanError("a plan needs at least two points, its start and its end, with values for each")
+        _check_size(len(self.times_ns), len(self.names))
         if self.times_ns[0] != 0:
             raise PlanError(f"the plan starts at {self.times_ns[0] / 1e9:g} s: its first point must be at 0 s")
         for i, (time, row) in enumerate(zip(self.times_ns, self.values, strict=True)):
@@ -144,6 +150,11 @@ class Plan:
         point = bisect_right(self.times_ns, stamp_ns) - 1
         return self.values[max(point, 0)][self.names.index(name)]
 
+    def plant_changes(self, point: int) -> dict[str, float]:
+        """The plant's parameters, by their names in the plant, that the plan gives at a point."""
+        row = zip(self.names, self.values[point], strict=True)
+        return {name.removeprefix(PLANT): value for name, value in row if name.startswith(PLANT)}
+
     def steps(self, sample_period_ns: int) -> int:
         """Number of steps of an episode: samples are at 0, h, …, steps·h.
 
@@ -161,28 +172,36 @@ class Plan:
     def sampled(self, sample_period_ns: int) -> SampledPlan:
         """The plan at the stamps k·sample_period_ns."""
         steps = self.steps(sample_period_ns)
-        stamps = np.arange(steps + 1, dtype=np.int64) * sample_period_ns
-        points = np.searchsorted(np.asarray(self.times_ns), stamps, side="right") - 1
+        # Point i holds from the first sample at its time or later, up to that of the next point.
+        first = -(-np.asarray(self.times_ns, dtype=np.int64) // sample_period_ns)
+        first = np.minimum(first, steps + 1)
         values = np.asarray(self.values, dtype=np.float64).reshape(len(self.times_ns), len(self.names))
-        column = {name: values[points, i] for i, name in enumerate(self.names)}
-        zero = np.zeros(steps + 1)
-        return SampledPlan(
-            sample_period_ns,
-            column.get("setpoint", zero),
-            column.get("disturbance", zero),
-            self._segments(column, steps),
-            self.start,
-        )
+        column = {name: values[:, i] for i, name in enumerate(self.names)}
+        samples = np.diff(first, append=steps + 1)
+        none = np.zeros(len(first))
+        setpoint, disturbance = (np.repeat(column.get(name, none), samples) for name in SIGNALS)
+        return SampledPlan(sample_period_ns, setpoint, disturbance, self._segments(column, first, steps), self.start)
 
-    def _segments(self, column: Mapping[str, np.ndarray], steps: int) -> tuple[Segment, ...]:
-        parameters = [name for name in self.names if name.startswith("plant.")]
+    def _segments(self, column: Mapping[str, np.ndarray], first: np.ndarray, steps: int) -> tuple[Segment, ...]:
+        """The stretches of constant plant parameters; `first` is each point's first sample."""
+        parameters = [name for name in self.names if name.startswith(PLANT)]
         if not parameters:
             return (Segment(0, steps, {}),)
-        table = np.stack([column[name][:steps] for name in parameters])
-        starts = [0, *(np.flatnonzero(np.any(np.diff(table, axis=1) != 0, axis=0)) + 1).tolist(), steps]
+        holds = np.flatnonzero((np.diff(first, append=steps + 1) > 0) & (first < steps))
+        table = np.stack([column[name][holds] for name in parameters])
+        changes = np.concatenate([[True], np.any(np.diff(table, axis=1) != 0, axis=0)])
+        starts = [*first[holds][changes].tolist(), steps]
         return tuple(
-            Segment(a, b, {name.removeprefix("plant."): float(column[name][a]) for name in parameters})
-            for a, b in zip(starts, starts[1:], strict=False)
+            Segment(a, b, dict(zip((name.removeprefix(PLANT) for name in parameters), row, strict=True)))
+            for (a, b), row in zip(pairwise(starts), table[:, changes].T.tolist(), strict=True)
+        )
+
+
+def _check_size(points: int, signals: int) -> None:
+    if points * signals > MOST_VALUES:
+        raise PlanError(
+            f"the plan has {points} points for {signals} signals: {MOST_VALUES} values at most; let ramps and sines "
+            "be shorter or the sample period longer"
         )
 
 
@@ -196,7 +215,7 @@ def parse_plan(lines: Sequence[str], sample_period_ns: int, plant_parameters: Co
         PlanError: with the line that is wrong.
     """
     entries = [_parse_line(i, str(line), plant_parameters) for i, line in enumerate(lines)]
-    for before, entry in zip(entries, entries[1:], strict=False):
+    for before, entry in pairwise(entries):
         if before.signal == "end":
             raise PlanError(f"{entry.where}: it comes after the end")
         if entry.time_ns < before.time_ns:
@@ -225,19 +244,21 @@ _SHAPES = {"ramp": ("ramp", 0, "over", 0), "sine": ("sine", 0, "period", 0, "for
 
 
 def _parse_line(index: int, text: str, known: Collection[str] | None) -> _Entry:
-    where = f"line {index + 1} {text!r}"
+    where = f"line {index + 1} {one_line(text, 100)!r}"
     words = text.split()
     if len(words) < 2:
         raise PlanError(f"{where}: expected {GRAMMAR}")
     time = _finite(words[0], where)
     if time < 0:
         raise PlanError(f"{where}: its time is negative")
+    if time > LONGEST_TIME:
+        raise PlanError(f"{where}: its time is beyond {LONGEST_TIME:g} s")
     signal = words[1]
     if signal == "end" and len(words) == 2:
         return _Entry(where, round(time * 1e9), "end", "step", ())
-    if known is not None and signal.startswith("plant.") and signal.removeprefix("plant.") not in known:
+    if known is not None and signal.startswith(PLANT) and signal.removeprefix(PLANT) not in known:
         raise PlanError(f"{where}: unknown plant parameter; those that may change are {', '.join(known) or 'none'}")
-    if signal not in (*SIGNALS, START) and not signal.startswith("plant."):
+    if signal not in (*SIGNALS, START) and not signal.startswith(PLANT):
         raise PlanError(f"{where}: unknown signal {signal!r}; expected {GRAMMAR}")
     shape, words = (words[2] if len(words) > 2 else ""), words[2:]
     if shape not in _SHAPES:
@@ -252,6 +273,8 @@ def _parse_line(index: int, text: str, known: Collection[str] | None) -> _Entry:
     numbers = tuple(_finite(word, where) for want, word in zip(pattern, words, strict=True) if want == 0)
     if any(number <= 0 for number in numbers[1:]):
         raise PlanError(f"{where}: durations and periods must be above 0")
+    if numbers[-1] > LONGEST_TIME:
+        raise PlanError(f"{where}: it lasts longer than {LONGEST_TIME:g} s")
     return _Entry(where, round(time * 1e9), signal, shape, numbers)
 
 
@@ -271,16 +294,30 @@ def _unroll(entries: list[_Entry], names: list[str], period_ns: int) -> Plan:
         raise PlanError(f"{entries[-1].where}: an episode has 1 to {LARGEST_PLAN} samples of {period_ns / 1e9:g} s")
     starts = {"setpoint": _start(entries), "disturbance": 0.0}
     tracks: dict[str, dict[int, float]] = {name: {0: starts[name]} if name in starts else {} for name in names}
-    for i, entry in enumerate(entries[:-1]):
-        if not tracks[entry.signal] and (entry.time_ns, entry.shape) != (0, "step"):
+    stops_ns = _stops(entries)
+    points = 0
+    for entry, stop_ns in zip(entries[:-1], stops_ns, strict=True):
+        track = tracks[entry.signal]
+        if not track and (entry.time_ns, entry.shape) != (0, "step"):
             raise PlanError(f"{entry.where}: give {entry.signal} a value at 0 s first")
-        following = [e.time_ns for e in entries[i + 1 :] if e.signal in (entry.signal, "end")]
-        tracks[entry.signal].update(
-            _points(entry, _value_at(tracks[entry.signal] or {0: 0.0}, entry.time_ns), following[0], period_ns)
-        )
+        points += (min(entry.until_ns, stop_ns) - entry.time_ns) // period_ns  # before they are made
+        _check_size(points, 1)
+        before = next(reversed(track.values()), 0.0)  # entries are in order, and no point lies beyond the next one
+        track.update(_points(entry, before, stop_ns, period_ns))
     times = sorted({0, end_ns, *(t for track in tracks.values() for t in track if t < end_ns)})
+    _check_size(len(times), len(names))
     columns = [_held(tracks[name], times) for name in names]
     return Plan(tuple(names), tuple(times), tuple(zip(*columns, strict=True)))
+
+
+def _stops(entries: Sequence[_Entry]) -> list[int]:
+    """For each entry but the last, the end, when the signal's next one begins, or else the end."""
+    following: dict[str, int] = {}
+    stops = []
+    for entry in reversed(entries[:-1]):
+        stops.append(following.get(entry.signal, entries[-1].time_ns))
+        following[entry.signal] = entry.time_ns
+    return stops[::-1]
 
 
 def _start(entries: Sequence[_Entry]) -> float:
@@ -309,10 +346,6 @@ def _points(entry: _Entry, start: float, stop_ns: int, period_ns: int) -> dict[i
     if entry.until_ns < stop_ns:
         points[entry.until_ns] = entry.numbers[0] if entry.shape == "ramp" else start
     return points
-
-
-def _value_at(track: Mapping[int, float], time_ns: int) -> float:
-    return track[max(t for t in track if t <= time_ns)]
 
 
 def _held(track: Mapping[int, float], times: Sequence[int]) -> list[float]:

@@ -1,9 +1,12 @@
 """Plans are read as written, and wrong lines are named."""
 
+import time
+import tracemalloc
+
 import numpy as np
 import pytest
 
-from tdof_npid_ros.scenario import Plan, PlanError, parse_plan
+from tdof_npid_ros.scenario import Plan, PlanError, Segment, parse_plan
 
 PERIOD_NS = 100_000_000
 
@@ -85,3 +88,54 @@ def test_a_bad_plan_is_refused_with_the_line_that_is_wrong(lines: list[str], wor
 def test_a_plan_from_a_message_is_checked_too(names, times, values, word: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(PlanError, match=word):
         Plan(names, times, values)
+
+
+def test_a_plan_of_ten_thousand_lines_is_read_at_once() -> None:
+    lines = [f"{i} setpoint {i % 7}" for i in range(10_000)]
+    began = time.monotonic()
+    assert len(parse_plan([*lines, "10000 end"], 10_000_000).times_ns) == 10_001
+    assert time.monotonic() - began < 5.0  # pairing each line with all others took a minute
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["0 setpoint ramp 1 over 99999", "99999 end"], "values at most"),
+        (["0 setpoint sine 1 period 1 for 99999", "99999 end"], "values at most"),
+        ([*(f"0 plant.x{i} 0" for i in range(999)), "0 setpoint ramp 1 over 9", "9 end"], "values at most"),
+        (["1e308 end"], "beyond 1e"),
+        (["0 setpoint ramp 1 over 1e308", "1 end"], "longer than"),
+        (["0 setpoint 1", "1e7 end"], "samples"),
+        (["0 " + "x" * 100_000 + " 1", "1 end"], "unknown signal"),
+        (["0 setpoint 1", "1 end" * 10_000], "line 2"),
+    ],
+)
+def test_plans_beyond_all_bounds_are_refused_before_they_take_memory(lines: list[str], words: str) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(PlanError, match=words):
+            parse_plan(lines, 10_000_000)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_plan_of_many_columns_takes_no_memory_for_them() -> None:
+    """Of a plant's parameters only the changes are kept, not a value per sample."""
+    names = tuple(f"plant.x{i}" for i in range(101))
+    plan = Plan(names, (0, 99_999 * 10**9), ((1.0,) * 101,) * 2)
+    tracemalloc.start()
+    try:
+        assert len(plan.sampled(10_000_000).segments) == 1
+        assert tracemalloc.get_traced_memory()[1] < 500e6  # two signals of ten million samples, not a hundred
+    finally:
+        tracemalloc.stop()
+
+
+def test_overlapping_points_within_a_sample_leave_the_last() -> None:
+    plan = parse_plan(
+        ["0 plant.a 1", "0.0101 plant.a 2", "0.0102 plant.a 3", "0.02 setpoint 1", "0.05 end"], 10_000_000
+    )
+    sampled = plan.sampled(10_000_000)
+    assert sampled.setpoint.tolist() == [0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
+    assert sampled.segments == (Segment(0, 2, {"a": 1.0}), Segment(2, 5, {"a": 3.0}))

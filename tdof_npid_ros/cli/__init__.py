@@ -38,7 +38,7 @@ class _Parser(argparse.ArgumentParser):
     """Says in one line what is wrong with the arguments."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(USAGE_ERROR, f"{self.prog}: {message}: see {self.prog} --help\n")
+        self.exit(USAGE_ERROR, f"{self.prog}: {one_line(message)}: see {self.prog} --help\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # before OSError, which it is: whoever reads our output has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return READER_GONE
-    except (ValueError, OSError, RuntimeError, MemoryError) as error:
+    except (ValueError, OSError, RuntimeError, MemoryError, ArithmeticError) as error:
         print(f"tdof-npid {name}: {_message(error)}", file=sys.stderr)
         return USAGE_ERROR
     except ModuleNotFoundError as error:

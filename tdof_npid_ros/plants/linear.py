@@ -16,6 +16,7 @@ from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
 
 LONGEST_DEAD_TIME = 1e9  # s
+LARGEST_ORDER = 20  # a step is compiled for its order: this one takes a minute
 MOST_DELAY = 1_000_000  # samples: what a lane's efforts on their way take of memory is 8 MB
 
 _PRECISION = threading.Lock()  # mpmath's precision belongs to the whole process
@@ -54,6 +55,10 @@ class TransferFunction:
             raise PlantError(
                 f"numerator of degree {len(self.numerator) - 1} over denominator of degree "
                 f"{len(self.denominator) - 1}: the numerator's degree must be the lower one (strictly proper)"
+            )
+        if len(self.denominator) - 1 > LARGEST_ORDER:
+            raise PlantError(
+                f"denominator is of degree {len(self.denominator) - 1}: it must be {LARGEST_ORDER} or less"
             )
         for name in ("output_offset", "effort_offset"):
             if not math.isfinite(getattr(self, name)):

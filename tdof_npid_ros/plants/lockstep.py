@@ -20,6 +20,7 @@ class Episode:
     """
 
     def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, label: EpisodeLabel) -> None:
+        plant_at(plan.plant_changes(0))  # its names first: to sample a plan takes memory
         signals = plan.sampled(simulator.sample_period_ns)
         if plan.start is not None:
             simulator.reset(plant_at_start(plant_at, plan.start, signals.segments[0].plant, simulator.effort_limits))

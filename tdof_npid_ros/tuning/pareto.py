@@ -24,6 +24,7 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 RATIOS = (0.1, 0.5, 1.0)  # L/T of Figure 6
 POPULATION = 96  # whole blocks of the compiled loop
 GENERATIONS = 200
+LARGEST_POPULATION = 2000  # NSGA-II compares each point with each other one
 
 PYMOO_NSGA2 = "pymoo.algorithms.moo.nsga2"
 
@@ -143,6 +144,8 @@ def pareto_front(
     """
     if seed < 0 or population < 4 or generations < 1:
         raise TuningError(f"seed {seed}, population {population}, generations {generations}: at least 0, 4 and 1")
+    if population > LARGEST_POPULATION:
+        raise TuningError(f"population is {population}: NSGA-II takes {LARGEST_POPULATION} or less")
     check_installed()
     nsga2, problems, optimize, callback = (
         importlib.import_module(name)

@@ -20,6 +20,12 @@ EPISODES = ("setpoint", "disturbance")
 POPULATION, GENERATIONS = 40, 200
 """By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""
 
+LARGEST_POPULATION = 100_000
+"""Candidates in memory at once."""
+
+LARGEST_BUDGET = 10**12
+"""Evaluations: more than a year of them."""
+
 LARGEST_WEIGHT = 1e100
 """So that the objective (10) stays finite."""
 
@@ -58,6 +64,11 @@ class TuningProblem:
     def __post_init__(self) -> None:
         if not 0.0 <= self.weight <= LARGEST_WEIGHT:
             raise TuningError(f"weight is {self.weight}: it must be a number from 0 to {LARGEST_WEIGHT:g}")
+        for name in ("population", "polish"):
+            if getattr(self, name) > LARGEST_POPULATION:
+                raise TuningError(f"{name} is {getattr(self, name):g}: it must be {LARGEST_POPULATION} or less")
+        if self.population * self.generations > LARGEST_BUDGET:
+            raise TuningError(f"population times generations must be {LARGEST_BUDGET:g} evaluations or less")
         if self.extra not in ((), ("sigma",)) or (self.extra and self.controller == "pid"):
             raise TuningError(f"{', '.join(self.extra)} cannot be freed for {self.controller}: only sigma, not for pid")
         missing = [episode for episode in EPISODES if episode not in self.case.episodes]

@@ -62,6 +62,21 @@ def test_the_weight_counts_in_the_objective(capsys: pytest.CaptureFixture[str]) 
     assert report["objective"] == report["setpoint"]["iae"] + 0.25 * report["disturbance"]["iae"]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [("--population", "1000000000"), ("--generations", "9" * 30), ("--budget", "9" * 30), ("--seed", "9" * 5000)],
+)
+def test_numbers_beyond_all_bounds_are_refused_before_they_take_memory(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, str]
+) -> None:
+    try:
+        line = refused(capsys, "p3-c1", "--controller", "pid", *arguments)
+    except SystemExit as end:  # by the parser
+        assert end.code == 2
+        line = capsys.readouterr().err
+    assert len(line) < 1000 and line.count("\n") == 1
+
+
 def test_sigma_moves_only_when_it_is_free(capsys: pytest.CaptureFixture[str]) -> None:
     assert tuned(capsys, "--controller", "npid")["gains"]["sigma"] == 1.0
     assert tuned(capsys, "--controller", "npid", "--free", "sigma")["gains"]["sigma"] != 1.0

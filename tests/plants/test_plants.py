@@ -173,6 +173,7 @@ def test_the_plants_own_limits_are_applied_and_reported() -> None:
         ("first_order", {"gain": "much"}, "gain"),
         ("transfer_function", {"numerator": [1.0, 0.0], "denominator": [1.0, 1.0]}, "strictly proper"),
         ("transfer_function", {"denominator": [0.0]}, "denominator"),
+        ("transfer_function", {"denominator": [1.0] * 51}, "degree 50: it must be 20 or less"),
         ("sprott", {"initial_state": [0.0]}, "initial_state"),
         ("no.such.module:Plant", {}, "no.such.module"),
         ("tests.test_plants:missing", {}, "missing"),
