@@ -62,8 +62,9 @@ def test_a_picture_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_simulate_draws_and_tabulates_each_episode(tmp_path: Path) -> None:
-    picture, table = tmp_path / "a.png", tmp_path / "a.csv"
-    assert main(["simulate", "p3-c1", "--plot", str(picture), "--csv", str(table), "--json"]) == 0
+    picture, table, page = (tmp_path / f"a.{kind}" for kind in ("png", "csv", "html"))
+    assert main(["simulate", "p3-c1", "--plot", str(picture), "--csv", str(table), "--html", str(page), "--json"]) == 0
+    assert "TDOF-NPID2" in page.read_text()
     rows = list(csv.DictReader(table.open()))
     assert {row["episode"] for row in rows} == {"setpoint", "disturbance"}
     assert float(rows[-1]["time"]) > 0.0 and picture.stat().st_size > 10_000

@@ -6,7 +6,7 @@ import argparse
 import csv
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 from tdof_npid_ros.advice import gravest
 from tdof_npid_ros.case import Case, find_parameter_file, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
-from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
+from tdof_npid_ros.interactive import Page, response_plots
 from tdof_npid_ros.loop import Trajectory
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.plotting import Curve, Panel, draw_responses
@@ -33,12 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what can be written of simulated responses."""
     parser.add_argument("--plot", type=Path, metavar="FILE", help="picture of the responses")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="one page with interactive plots, for any browser")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="the responses, a row for each sample of each episode")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of the case's setpoint and disturbance episodes, and the margins."""
-    check_outputs([path for path in (arguments.plot, arguments.csv) if path], [find_parameter_file(arguments.case)])
+    check_outputs(outputs_of(arguments), [find_parameter_file(arguments.case)])
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
     found = margins(case, gains)
@@ -47,6 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
     lines = [headline(case, gains), *_table(report), *(f"  margins      {line}" for line in found.lines())]
     print(json.dumps(report) if arguments.json else "\n".join(lines))
     return 0
+
+
+def outputs_of(arguments: argparse.Namespace) -> list[Path]:
+    """The files that `add_output_arguments` are to be written to."""
+    return [path for path in (arguments.plot, arguments.html, arguments.csv) if path]
 
 
 def title(gains: Gains) -> str:
@@ -60,11 +67,14 @@ def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Nam
     Args:
         of: gains by what their curves are called.
     """
-    if not (arguments.plot or arguments.csv):
+    if not outputs_of(arguments):
         return
     runs = {name: {label: case.simulate(name, gains) for label, gains in of.items()} for name in case.plans}
+    panels = [_panel(case, name, curves) for name, curves in runs.items()]
     if arguments.plot:
-        draw_responses([_panel(case, name, curves) for name, curves in runs.items()], arguments.plot, title=case.name)
+        draw_responses(panels, arguments.plot, title=case.name)
+    if arguments.html:
+        _page(case, of, panels).write(arguments.html)
     if arguments.csv:
         with arguments.csv.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
@@ -73,6 +83,30 @@ def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Nam
                 for label, run in curves.items():
                     columns = (run.time, run.setpoint, run.disturbance, run.output[:, 0], run.control_effort[:, 0])
                     table.writerows((name, label, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
+
+
+def _page(case: Case, of: Mapping[str, Gains], panels: Sequence[Panel]) -> Page:
+    page = Page(case.name)
+    reports = {label: response_report(case, gains) for label, gains in of.items()}
+    metrics = [
+        (episode, name) for episode in ("setpoint", "disturbance") for name in next(iter(reports.values()))[episode]
+    ]
+    metrics = [pair for pair in metrics if pair[1] != "reason"]
+    page.table(
+        [
+            ["", *(f"{episode}: {name.replace('_', ' ')}" for episode, name in metrics)],
+            *(
+                [label, *("-" if (v := report[e][n]) is None else _number(v) for e, n in metrics)]
+                for label, report in reports.items()
+            ),
+        ]
+    )
+    for panel in panels:
+        page.heading(panel.title)
+        page.plot(*response_plots(panel))
+    page.heading("Gains")
+    page.table([["", *PER_LANE], *([label, *(f"{getattr(g, n):g}" for n in PER_LANE)] for label, g in of.items())])
+    return page
 
 
 def _panel(case: Case, name: str, runs: Mapping[str, Trajectory]) -> Panel:

@@ -18,7 +18,14 @@ import numpy as np
 
 from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
 from tdof_npid_ros.cli import INTERRUPTED
-from tdof_npid_ros.cli.simulate import add_output_arguments, advised, response_report, title, write_responses
+from tdof_npid_ros.cli.simulate import (
+    add_output_arguments,
+    advised,
+    outputs_of,
+    response_report,
+    title,
+    write_responses,
+)
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
@@ -112,7 +119,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse outputs that cannot be written before hours are spent on what goes there."""
     if arguments.resume and not arguments.checkpoint:
         raise TuningError("--resume needs --checkpoint FILE: what to go on from")
-    written = [path for path in (arguments.checkpoint, arguments.out, arguments.plot, arguments.csv) if path]
+    written = [path for path in (arguments.checkpoint, arguments.out) if path] + outputs_of(arguments)
     check_outputs(written, [find_parameter_file(arguments.case)])
     if arguments.out:
         check_replaceable(arguments.out, "controller", Gains().as_dict())
