@@ -65,8 +65,8 @@ def run(size: str) -> Result:
 
 def tuning_time(generations: int) -> float:
     """Wall time of the generations of one run of the tuner node, on one loop of this machine."""
-    from tdof_npid_ros.case import find_parameter_file
     from tdof_npid_ros.graph.processes import NodeProcesses
+    from tdof_npid_ros.parameter_file import find_parameter_file
 
     loop, file = f"{NAMESPACE}_loop", find_parameter_file(CASE)
     with (

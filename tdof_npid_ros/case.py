@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,23 +12,16 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros import loop
-from tdof_npid_ros.control.gains import (
-    CONTROLLER_TYPES,
-    PER_LANE,
-    ControllerType,
-    Gains,
-    GainsError,
-    gains_from_mapping,
-)
+from tdof_npid_ros.control.gains import PER_LANE, Gains, GainsError, gains_from_mapping
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
-from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
-from tdof_npid_ros.parameters import OF_NODE, unknown_parameters
-from tdof_npid_ros.plants.catalog import FIXED_WHILE_RUNNING, make_plant, model_parameters, named_model
-from tdof_npid_ros.plants.plant import Plant, PlantError
-from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan
+from tdof_npid_ros.parameter import Table
+from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
+from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
+from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
+from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
-DEFAULT_SAMPLE_PERIOD = 0.01  # s
 Bounds = tuple[float, float]
 
 
@@ -57,7 +48,7 @@ class Case:
     gains: Gains
     episodes: Mapping[str, tuple[str, ...]]
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
-    weight: float = 1.0
+    weight: float = WEIGHT.default
     options: ControllerOptions = PLAIN
 
     @property
@@ -124,7 +115,7 @@ class Case:
     def integrals(self, episode: str, gains: Gains) -> loop.Integrals:
         """Run an episode in process and keep only its integrals."""
         if not self.options.is_plain:
-            raise PlantError(
+            raise GainsError(
                 f"{self.name}: tuning runs the law alone; take these out of the controller's parameters first: "
                 + ", ".join(name for name, value in self.options.as_dict().items() if value != PLAIN.as_dict()[name])
             )
@@ -179,29 +170,6 @@ def _no_single_step(case: Case, episode: str, why: str) -> PlanError:
     )
 
 
-def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
-    """The plant's parameters that may change while the loop runs, with their configured values."""
-    return {
-        name: float(values.get(name, default))
-        for name, default in model_parameters(model).items()
-        if name not in FIXED_WHILE_RUNNING and not isinstance(default, list)
-    }
-
-
-def sample_period_in_ns(value: Any) -> int:
-    """A sample period in s as a whole number of nanoseconds.
-
-    Raises:
-        ParameterFileError: not a number of seconds above 0, or no whole number of nanoseconds.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise ParameterFileError(f"sample_period is {value!r}: it must be a number of seconds above 0")
-    period_ns = round(value * 1e9)
-    if period_ns < 1 or abs(period_ns - value * 1e9) > 1e-3:
-        raise ParameterFileError(f"sample_period is {value!r} s: it must be a whole number of nanoseconds")
-    return period_ns
-
-
 def load_case(name: str | Path) -> Case:
     """A case by its name (`p1-c0.5`) or by the path of its parameter file; misspelt parameters are warned of.
 
@@ -210,7 +178,12 @@ def load_case(name: str | Path) -> Case:
     """
     path = find_parameter_file(name)
     nodes = {node: read_parameters(path, node) for node in ("plant", "controller", "scenario", "tuner")}
-    plant, controller, scenario, tuner = nodes.values()
+    try:
+        model = named_model(nodes["plant"].get("model", PLANT["model"].default), path.parent)
+        tables: dict[str, Table] = {**NODES, "plant": {**PLANT, **model_table(model)}}
+        plant, controller, scenario, tuner = (_checked(values, tables[node]) for node, values in nodes.items())
+    except ValueError as error:
+        raise type(error)(f"{path}: {error}") from error
     periods = {
         node: values["sample_period"]
         for node, values in (("plant", plant), ("controller", controller), ("scenario", scenario))
@@ -222,115 +195,34 @@ def load_case(name: str | Path) -> Case:
     try:
         case = Case(
             name=path.stem,
-            sample_period_ns=sample_period_in_ns(plant.get("sample_period", DEFAULT_SAMPLE_PERIOD)),
-            model=named_model(plant.get("model", "first_order"), path.parent),
+            sample_period_ns=sample_period_in_ns(plant.get("sample_period", SAMPLE_PERIOD.default)),
+            model=model,
             plant_values=plant,
-            effort_limits=_effort_limits(plant),
+            effort_limits=effort_limits(plant),
             gains=gains_from_mapping(controller),
             episodes=read_episodes(scenario),
-            bounds=_bounds(tuner),
-            weight=_number("weight", tuner.get("weight", 1.0)),
+            bounds=read_bounds(tuner),
+            weight=tuner.get("weight", WEIGHT.default),
             options=options_from_mapping(controller),
         )
         _ = case.plant, case.plans
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
     for node, values in nodes.items():
-        known = (*OF_NODE[node], *(model_parameters(case.model) if node == "plant" else ()))
-        for warning in unknown_parameters(values, known):
+        for warning in misspelt(values, tables[node]):
             warnings.warn(f"{path}: {node}: {warning}", stacklevel=2)
     return case
 
 
-def find_parameter_file(name: str | Path) -> Path:
-    """Where the parameter file of a case lies: the path itself, or `config/<name>.yaml` of the package.
+def _checked(values: Mapping[str, Any], known: Table) -> dict[str, Any]:
+    """What a file gives to a node, as its parameters take it; what they do not know stays as it is.
 
     Raises:
-        ParameterFileError: there is none.
+        ParameterError: a value that its parameter cannot have.
     """
-    path = Path(name)
-    if path.suffix in (".yaml", ".yml") or path.is_file():
-        return path
-    folder = config_folder()
-    found = folder / f"{name}.yaml"
-    if not found.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none"
-        raise ParameterFileError(f"no case {str(name)!r}: the cases are {known}, or give the path of a parameter file")
-    return found
+    return {name: known[name].checked(value) if name in known else value for name, value in values.items()}
 
 
-def config_folder() -> Path:
-    """The folder of the package's parameter files: beside the package in a checkout, else under `share/`."""
-    package = Path(__file__).parent
-    candidates = [package.parent / "config"]
-    candidates += [parent / "share" / "tdof_npid_ros" / "config" for parent in (*package.parents, Path(sys.prefix))]
-    return next((folder for folder in candidates if folder.is_dir()), candidates[0])
-
-
-def read_episodes(scenario: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """The lines of each episode from the scenario's parameters `episodes` and `plan.<episode>`.
-
-    Raises:
-        PlanError: `episodes` is no list of names, or an episode has no plan.
-    """
-    names = scenario.get("episodes", [])
-    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
-        raise PlanError(f"episodes is {names!r}: it must be a list of names, as [setpoint, disturbance]")
-    episodes = {}
-    for name in names:
-        lines = scenario.get(f"plan.{name}")
-        if not isinstance(lines, (list, tuple)) or not lines:
-            raise PlanError(f"episode {name!r} has no plan: give its lines as the list of strings plan.{name}")
-        episodes[name] = tuple(str(line) for line in lines)
-    return episodes
-
-
-def _effort_limits(plant: Mapping[str, Any]) -> tuple[float, float]:
-    low = _number("effort_min", plant.get("effort_min", -math.inf))
-    high = _number("effort_max", plant.get("effort_max", math.inf))
-    if not low <= high:
-        raise ParameterFileError(f"effort_min is {low:g} and effort_max {high:g}: need effort_min <= effort_max")
-    return low, high
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-        raise ParameterFileError(f"{name} is {value!r}: it must be a number")
-    return float(value)
-
-
-def _bounds(tuner: Mapping[str, Any]) -> dict[str, Bounds]:
-    bounds = {}
-    for name in PER_LANE:
-        if f"bounds.{name}" in tuner:
-            bounds[name] = read_bounds(name, tuner[f"bounds.{name}"])
-    return bounds
-
-
-def read_bounds(name: str, value: Any) -> Bounds:
-    """Lower and upper bound of a gain.
-
-    Raises:
-        ParameterFileError: not two finite numbers in order.
-    """
-    good = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(v, (int, float)) for v in value)
-    if not good or not -math.inf < value[0] < value[1] < math.inf:
-        raise ParameterFileError(
-            f"bounds.{name} is {value!r}: it must be [lower, upper] with lower < upper, both finite"
-        )
-    return float(value[0]), float(value[1])
-
-
-def controller_type(value: str) -> ControllerType:
-    """A controller type by name.
-
-    Raises:
-        ParameterFileError: there is no such type.
-    """
-    for known in CONTROLLER_TYPES:
-        if value == known:
-            return known
-    raise ParameterFileError(f"no controller type {value!r}: the types are {', '.join(CONTROLLER_TYPES)}")
-
-
-__all__ = ["Case", "PlantError", "load_case"]
+def read_bounds(tuner: Mapping[str, Any]) -> dict[str, Bounds]:
+    """Lower and upper bound of each gain that has some, from the tuner's parameters as their table takes them."""
+    return {gain: (tuner[name][0], tuner[name][1]) for gain in PER_LANE if (name := f"bounds.{gain}") in tuner}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,31 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     own: dict[str, Any] = {}
     _collect(document, node, path, shared, own)
     return shared | own
+
+
+def find_parameter_file(name: str | Path) -> Path:
+    """Where the parameter file of a case lies: the path itself, or `config/<name>.yaml` of the package.
+
+    Raises:
+        ParameterFileError: there is none.
+    """
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path
+    folder = config_folder()
+    found = folder / f"{name}.yaml"
+    if not found.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none"
+        raise ParameterFileError(f"no case {str(name)!r}: the cases are {known}, or give the path of a parameter file")
+    return found
+
+
+def config_folder() -> Path:
+    """The folder of the package's parameter files: beside the package in a checkout, else under `share/`."""
+    package = Path(__file__).parent
+    candidates = [package.parent / "config"]
+    candidates += [parent / "share" / "tdof_npid_ros" / "config" for parent in (*package.parents, Path(sys.prefix))]
+    return next((folder for folder in candidates if folder.is_dir()), candidates[0])
 
 
 def check_replaceable(path: Path, node: str, names: Collection[str]) -> None:

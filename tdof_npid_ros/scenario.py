@@ -25,7 +25,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -354,3 +354,21 @@ def _held(track: Mapping[int, float], times: Sequence[int]) -> list[float]:
         current = track.get(t, current)
         values.append(current)
     return values
+
+
+def read_episodes(scenario: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """The lines of each episode from the scenario's parameters `episodes` and `plan.<episode>`.
+
+    Raises:
+        PlanError: `episodes` is no list of names, or an episode has no plan.
+    """
+    names = scenario.get("episodes", [])
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise PlanError(f"episodes is {names!r}: it must be a list of names, as [setpoint, disturbance]")
+    episodes = {}
+    for name in names:
+        lines = scenario.get(f"plan.{name}")
+        if not isinstance(lines, (list, tuple)) or not lines:
+            raise PlanError(f"episode {name!r} has no plan: give its lines as the list of strings plan.{name}")
+        episodes[name] = tuple(str(line) for line in lines)
+    return episodes

@@ -13,10 +13,10 @@ from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations
 from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
-from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, parse_plan
+from tdof_npid_ros.parameters import sample_period_in_ns
+from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, parse_plan, read_episodes
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains, gains_from_mapping
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
+from tdof_npid_ros.parameters import sample_period_in_ns
 
 TOPIC = "/parameter_events"
 # The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.

@@ -16,10 +16,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdof_npid_ros.case import Case, controller_type, find_parameter_file, load_case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.gains import gains_by_source
-from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.control.gains import PER_LANE, Gains, controller_type
 from tdof_npid_ros.paper.tables import COMPARED, published
+from tdof_npid_ros.parameter_file import find_parameter_file
 
 CASE = "p1-c0.5"
 NAMESPACE = "/demo"

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tdof_npid_ros.case import Case, controller_type
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, Gains, gains_from_mapping
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, Gains, controller_type, gains_from_mapping
 from tdof_npid_ros.paper.tables import published
 from tdof_npid_ros.paper.tuned import tuned
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters

@@ -6,10 +6,11 @@ import argparse
 import json
 from pathlib import Path
 
-from tdof_npid_ros.case import find_parameter_file, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
 from tdof_npid_ros.cli.simulate import title
 from tdof_npid_ros.output_file import check_outputs
+from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.stability.margins import margins
 from tdof_npid_ros.stability.picture import draw_margins
 

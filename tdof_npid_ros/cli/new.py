@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tdof_npid_ros.case import controller_type, load_case
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.case import load_case
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
 from tdof_npid_ros.draft import Draft, Process, process_of
 from tdof_npid_ros.output_file import OutputError, check_writable
 from tdof_npid_ros.parameter_file import ParameterFileError

@@ -11,8 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tdof_npid_ros.case import controller_type
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
 from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.parameter_file import write_parameters

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros.advice import gravest
-from tdof_npid_ros.case import Case, find_parameter_file, load_case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
 from tdof_npid_ros.interactive import Page, response_plots
 from tdof_npid_ros.loop import Trajectory
 from tdof_npid_ros.output_file import check_outputs
+from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.plotting import Curve, Panel, draw_responses
 from tdof_npid_ros.stability.margins import margins
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.case import controller_type, find_parameter_file, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import (
     add_output_arguments,
@@ -26,9 +26,9 @@ from tdof_npid_ros.cli.simulate import (
     title,
     write_responses,
 )
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, controller_type
 from tdof_npid_ros.output_file import check_outputs
-from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
+from tdof_npid_ros.parameter_file import check_replaceable, find_parameter_file, write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS

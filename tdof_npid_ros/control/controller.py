@@ -6,6 +6,7 @@ It knows no ROS. The controller node calls `answer` for each message, `verify` f
 from __future__ import annotations
 
 import hashlib
+from dataclasses import fields
 from functools import lru_cache
 
 import numpy as np
@@ -308,6 +309,27 @@ class _Law:
 
 @lru_cache(maxsize=1024)
 def parameters_digest(gains: Gains, sample_period_ns: int, options: ControllerOptions = PLAIN) -> str:
-    """A name for what answers are computed with: 12 hexadecimal digits made from the values alone."""
-    content = repr((sorted(gains.as_dict().items()), sorted(options.as_dict().items()), sample_period_ns))
+    """A name for what answers are computed with: 12 hexadecimal digits made from the values alone.
+
+    An option that is added later has no part in it as long as it is at its default, so the digests in recorded bags
+    are found for ever.
+    """
+    content = repr((_named(gains), _named(options), sample_period_ns))
     return hashlib.sha256(content.encode()).hexdigest()[:12]
+
+
+# What the first bags' digests were made of: these have their part in it also at their defaults.
+_ALWAYS_NAMED = frozenset(
+    (
+        *("type", "kp", "ki", "kd", "alpha", "beta", "sigma", "n", "effort_min", "effort_max", "anti_windup"),
+        *("tracking_time", "integral_min", "integral_max", "manual", "manual_effort", "setpoint_min", "setpoint_max"),
+        *("setpoint_rate", "effort_rate", "dead_band", "filter_time", "angle", "bumpless"),
+    )
+)
+
+
+def _named(values: Gains | ControllerOptions) -> list[tuple[str, object]]:
+    default = {field.name: field.default for field in fields(values)}
+    return sorted(
+        (name, value) for name, value in values.as_dict().items() if name in _ALWAYS_NAMED or value != default[name]
+    )

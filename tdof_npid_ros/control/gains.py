@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
-ControllerType = Literal["pid", "npid", "tdof_npid1", "tdof_npid2"]
-AntiWindup = Literal["none", "conditional", "back_calculation"]
-CONTROLLER_TYPES: tuple[ControllerType, ...] = get_args(ControllerType)
-ANTI_WINDUP: tuple[AntiWindup, ...] = get_args(AntiWindup)
+from tdof_npid_ros.parameter import ParameterError, Table, check_limits
+from tdof_npid_ros.parameters import ANTI_WINDUP as ANTI_WINDUP
+from tdof_npid_ros.parameters import CONTROLLER_TYPES as CONTROLLER_TYPES
+from tdof_npid_ros.parameters import GAINS, TUNED_GAINS
+from tdof_npid_ros.parameters import LARGEST_GAIN as LARGEST_GAIN
+from tdof_npid_ros.parameters import LARGEST_SIGNAL as LARGEST_SIGNAL
+from tdof_npid_ros.parameters import AntiWindup as AntiWindup
+from tdof_npid_ros.parameters import ControllerType as ControllerType
+
 TUNED: dict[ControllerType, tuple[str, ...]] = {
     "pid": ("kp", "ki", "kd"),
     "npid": ("kp", "ki", "kd"),
     "tdof_npid1": ("kp", "ki", "kd", "alpha"),
     "tdof_npid2": ("kp", "ki", "kd", "alpha", "beta"),
 }  # the gains that the paper tunes for each type (section 3.3)
-PER_LANE = ("kp", "ki", "kd", "alpha", "beta", "sigma")
+PER_LANE = TUNED_GAINS
 LIMITS_PER_LANE = ("effort_min", "effort_max")
 ALL_PER_LANE = PER_LANE + LIMITS_PER_LANE
-
-# Within these bounds no effort overflows, whatever the gains, setpoints and outputs are.
-LARGEST_GAIN = 1e50  # in SI units, of the absolute value; 1/LARGEST_GAIN is the smallest sigma
-LARGEST_SIGNAL = 1e100  # of setpoints and outputs
 
 Lanes = float | tuple[float, ...]
 
@@ -48,60 +48,39 @@ class Gains:
         GainsError: a value is not finite or out of its range, or the gains contradict each other.
     """
 
-    type: ControllerType = "tdof_npid2"
-    kp: Lanes = 1.0
-    ki: Lanes = 0.0
-    kd: Lanes = 0.0
-    alpha: Lanes = 0.0
-    beta: Lanes = 0.0
-    sigma: Lanes = 1.0
-    n: float = 10.0
-    effort_min: Lanes = -math.inf
-    effort_max: Lanes = math.inf
-    anti_windup: AntiWindup = "conditional"
-    tracking_time: float = 0.0
-    integral_min: float = -math.inf
-    integral_max: float = math.inf
+    type: ControllerType = GAINS["type"].default
+    kp: Lanes = GAINS["kp"].default
+    ki: Lanes = GAINS["ki"].default
+    kd: Lanes = GAINS["kd"].default
+    alpha: Lanes = GAINS["alpha"].default
+    beta: Lanes = GAINS["beta"].default
+    sigma: Lanes = GAINS["sigma"].default
+    n: float = GAINS["n"].default
+    effort_min: Lanes = GAINS["effort_min"].default
+    effort_max: Lanes = GAINS["effort_max"].default
+    anti_windup: AntiWindup = GAINS["anti_windup"].default
+    tracking_time: float = GAINS["tracking_time"].default
+    integral_min: float = GAINS["integral_min"].default
+    integral_max: float = GAINS["integral_max"].default
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ALL_PER_LANE:
-                object.__setattr__(self, field.name, lanes_of(field.name, value))
-            elif field.name not in ("type", "anti_windup"):
-                object.__setattr__(self, field.name, number_of(field.name, value))
-        self._validate()
+        try:
+            take_checked(self, GAINS)
+            for low, high in (LIMITS_PER_LANE, ("integral_min", "integral_max")):
+                check_limits(low, getattr(self, low), high, getattr(self, high))
+        except ParameterError as error:
+            raise GainsError(str(error)) from None
+        self._check_lanes()
+        self._check_signs()
 
-    def _validate(self) -> None:
-        _choice("type", self.type, CONTROLLER_TYPES)
-        _choice("anti_windup", self.anti_windup, ANTI_WINDUP)
-        for name in PER_LANE:
-            for value in _as_tuple(getattr(self, name)):
-                if not math.isfinite(value):
-                    raise GainsError(f"{name} is {value}: it must be finite")
-                if abs(value) > LARGEST_GAIN:
-                    raise GainsError(f"{name} is {value}: it must be within +-{LARGEST_GAIN:g}")
-        if any(sigma < 1.0 / LARGEST_GAIN for sigma in _as_tuple(self.sigma)):
-            raise GainsError(
-                f"sigma is {self.sigma}: it must be above 0, at least {1.0 / LARGEST_GAIN:g} "
-                "(a large one makes the law nearly linear)"
-            )
-        if not 0 < self.n < math.inf:
-            raise GainsError(f"n is {self.n}: the derivative filter needs a finite n above 0 (usual: 5 to 30)")
-        if not 0 <= self.tracking_time < math.inf:
-            raise GainsError(
-                f"tracking_time is {self.tracking_time} s: it must be finite and not below 0 (0: automatic)"
-            )
-        for low, high in (LIMITS_PER_LANE, ("integral_min", "integral_max")):
-            check_limits(self, low, high)
+    def _check_lanes(self) -> None:
         lanes = self.lanes
         for name in ALL_PER_LANE:
             length = len(_as_tuple(getattr(self, name)))
             if length not in (1, lanes):
                 raise GainsError(f"{name} has {length} values, but there are {lanes} lanes: give one, or one per lane")
-        self._validate_signs()
 
-    def _validate_signs(self) -> None:
+    def _check_signs(self) -> None:
         kp, ki, kd = (self.per_lane(name) for name in ("kp", "ki", "kd"))
         if np.any((kp == 0) & (kd != 0)):
             raise GainsError("kd is not 0 but kp is 0: the derivative time T_d = kd/kp needs kp")
@@ -151,41 +130,30 @@ def gains_from_mapping(values: Mapping[str, Any]) -> Gains:
     return Gains(**{name: values[name] for name in GAIN_NAMES if name in values})
 
 
-def check_limits(values: Any, low: str, high: str) -> None:
-    """Raise GainsError unless there are finite numbers between the attributes `low` and `high`, in every lane."""
-    lowers, uppers = np.atleast_1d(getattr(values, low)), np.atleast_1d(getattr(values, high))
-    if len(lowers) != len(uppers) and 1 not in (len(lowers), len(uppers)):
-        raise GainsError(f"{low} has {len(lowers)} values and {high} {len(uppers)}: give one, or one per lane")
-    for lower, upper in np.broadcast(lowers, uppers):
-        if not lower <= upper:
-            raise GainsError(f"{low} is {lower} and {high} is {upper}: need {low} <= {high}")
-        if lower == math.inf or upper == -math.inf:
-            raise GainsError(f"{low} is {lower} and {high} is {upper}: no finite number is within")
+def controller_type(value: object) -> ControllerType:
+    """A controller type by name.
+
+    Raises:
+        GainsError: there is no such type.
+    """
+    for known in CONTROLLER_TYPES:
+        if value == known:
+            return known
+    raise GainsError(f"no controller type {value!r}: the types are {', '.join(CONTROLLER_TYPES)}")
 
 
-def number_of(name: str, value: Any) -> float:
-    """A parameter's value as a number; GainsError if it is none, or nan."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
-        raise GainsError(f"{name} is {value!r}: it must be a number (.inf is infinity)")
-    if math.isnan(value):
-        raise GainsError(f"{name} is nan: it must be a number")
-    return float(value)
+def take_checked(values: Any, its: Table) -> None:
+    """Replace the fields of a frozen dataclass by what their parameters make of them; lists become tuples.
 
-
-def lanes_of(name: str, value: Any) -> Lanes:
-    """A parameter's value as one number, or a tuple with one per lane; GainsError if it is neither."""
-    if isinstance(value, (str, bytes)) or not hasattr(value, "__len__"):
-        return number_of(name, value)
-    if len(value) == 0:
-        raise GainsError(f"{name} is an empty array: give one number, or one per lane")
-    numbers = tuple(number_of(name, one) for one in value)
-    return numbers if len(numbers) > 1 else numbers[0]
+    Raises:
+        ParameterError: a field has a value that its parameter cannot have.
+    """
+    for field in fields(values):
+        value = its[field.name].checked(getattr(values, field.name))
+        if isinstance(value, list):
+            value = tuple(value) if len(value) > 1 else value[0]
+        object.__setattr__(values, field.name, value)
 
 
 def _as_tuple(value: Lanes) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
-
-
-def _choice(name: str, value: Any, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise GainsError(f"{name} is {value!r}: it must be one of {', '.join(known)}")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
-
-from tdof_npid_ros.control.gains import Gains, GainsError, Lanes, check_limits, lanes_of, number_of
+from tdof_npid_ros.control.gains import Gains, GainsError, Lanes, take_checked
+from tdof_npid_ros.parameter import ParameterError, check_limits
+from tdof_npid_ros.parameters import OPTIONS
 
 
 @dataclass(frozen=True)
@@ -31,36 +30,23 @@ class ControllerOptions:
         GainsError: a value is out of its range.
     """
 
-    manual: bool = False
-    manual_effort: Lanes = 0.0
-    setpoint_min: float = -math.inf
-    setpoint_max: float = math.inf
-    setpoint_rate: float = math.inf
-    effort_rate: float = math.inf
-    dead_band: float = 0.0
-    filter_time: float = 0.0
-    angle: bool = False
-    bumpless: bool = True
+    manual: bool = OPTIONS["manual"].default
+    manual_effort: Lanes = OPTIONS["manual_effort"].default
+    setpoint_min: float = OPTIONS["setpoint_min"].default
+    setpoint_max: float = OPTIONS["setpoint_max"].default
+    setpoint_rate: float = OPTIONS["setpoint_rate"].default
+    effort_rate: float = OPTIONS["effort_rate"].default
+    dead_band: float = OPTIONS["dead_band"].default
+    filter_time: float = OPTIONS["filter_time"].default
+    angle: bool = OPTIONS["angle"].default
+    bumpless: bool = OPTIONS["bumpless"].default
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in SWITCHES:
-                if not isinstance(value, bool):
-                    raise GainsError(f"{field.name} is {value!r}: it must be true or false")
-            elif field.name == "manual_effort":
-                object.__setattr__(self, field.name, lanes_of(field.name, value))
-            else:
-                object.__setattr__(self, field.name, number_of(field.name, value))
-        if not np.isfinite(self.manual_effort).all():
-            raise GainsError(f"manual_effort is {self.manual_effort}: it must be finite")
-        check_limits(self, "setpoint_min", "setpoint_max")
-        for name in ("setpoint_rate", "effort_rate"):
-            if not getattr(self, name) > 0:
-                raise GainsError(f"{name} is {getattr(self, name)}: it must be above 0 (inf: no limit)")
-        for name in ("dead_band", "filter_time"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise GainsError(f"{name} is {getattr(self, name)}: it must be finite and not below 0")
+        try:
+            take_checked(self, OPTIONS)
+            check_limits("setpoint_min", self.setpoint_min, "setpoint_max", self.setpoint_max)
+        except ParameterError as error:
+            raise GainsError(str(error)) from None
 
     @property
     def is_plain(self) -> bool:
@@ -80,7 +66,6 @@ class ControllerOptions:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-SWITCHES = ("manual", "angle", "bumpless")
 PLAIN = ControllerOptions()
 OPTION_NAMES = tuple(field.name for field in fields(ControllerOptions))
 

@@ -13,15 +13,14 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, LARGEST_SIGNAL, Gains, gains_from_mapping
+from tdof_npid_ros.control.gains import Gains, gains_from_mapping
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
+from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
 from tdof_npid_ros.control.session import OUT_OF_STEP, Answer, Outcome, Session
 from tdof_npid_ros.graph.runtime.endpoints import signal_qos
-from tdof_npid_ros.graph.runtime.loop_end import TIMING_RANGES, LoopEnd, patience_ns
+from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.runtime.node import (
     ERROR,
@@ -30,38 +29,11 @@ from tdof_npid_ros.graph.runtime.node import (
     SIGNAL_QOS,
     STEADY,
     WARN,
-    number,
     run_node,
 )
+from tdof_npid_ros.parameters import CONTROLLER, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
 from tdof_npid_ros.wire import Sample, SignalWriter
 
-DESCRIPTIONS = {
-    "type": f"control law: {', '.join(CONTROLLER_TYPES)}",
-    "kp": "proportional gain K_p, effort per output unit; an array gives one value per lane",
-    "ki": "integral gain K_i, effort per output unit and second",
-    "kd": "derivative gain K_d, effort per output unit times seconds",
-    "alpha": "setpoint weight on the proportional action (6); tdof_npid1 and tdof_npid2",
-    "beta": "setpoint weight on the derivative action (6); tdof_npid2",
-    "sigma": "width of the nonlinear gain (4), in the output's unit, above 0; all but pid",
-    "n": "derivative filter N (1b), above 0; usually 5 to 30",
-    "effort_min": "lower limit of the effort; an array gives one value per lane",
-    "effort_max": "upper limit of the effort; an array gives one value per lane",
-    "anti_windup": f"what the integral action does at a limit: {', '.join(ANTI_WINDUP)}",
-    "tracking_time": "s; of back_calculation; 0: sqrt(kd/ki), or kp/ki without derivative action",
-    "integral_min": "lower limit of the integral action, in the effort's unit",
-    "integral_max": "upper limit of the integral action, in the effort's unit",
-    "manual": "true: the effort is manual_effort; back to false without a jump",
-    "manual_effort": "effort in manual mode; an array gives one value per lane; also set by the topic manual_effort",
-    "setpoint_min": "lower limit of the setpoint, in the output's unit",
-    "setpoint_max": "upper limit of the setpoint, in the output's unit",
-    "setpoint_rate": "output units per second that the setpoint moves at most, above 0; inf: no ramp",
-    "effort_rate": "effort per second that the effort moves at most, above 0; inf: no limit",
-    "dead_band": "error that counts as none, in the output's unit",
-    "filter_time": "s; time constant of the output's first-order filter; 0: none",
-    "angle": "true: setpoint and output are angles in rad, the error is the shorter way round",
-    "bumpless": "true: changes of gains and type do not move the effort at once",
-}
-RANGES = {"output_timeout": (0.0, 3600.0), **TIMING_RANGES}
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
 
@@ -70,37 +42,22 @@ class ControllerNode(LoopEnd):
 
     def __init__(self) -> None:
         super().__init__("controller")
-        period = self.declare_value("sample_period", 0.01, "s; time between two outputs", fixed=True)
-        default = {**Gains().as_dict(), **PLAIN.as_dict()}
-        given = {name: self.declare_value(name, default[name], text) for name, text in DESCRIPTIONS.items()}
+        given = self.declare_all(CONTROLLER)
         self.quiet_parameters.add("manual_effort")
-        self._declare_options()
         self.controller = Controller(
-            gains_from_mapping(given), sample_period_in_ns(period), options_from_mapping(given)
+            gains_from_mapping(given), sample_period_in_ns(given["sample_period"]), options_from_mapping(given)
         )
         self.controller.warm_up()
-        self.joints = Joints(self.values_of(["joint_names"])["joint_names"])
+        self.joints = Joints(given["joint_names"])
         if self.joints.names and len(self.joints.names) != self.controller.lanes:
             raise ValueError(
                 f"joint_names has {len(self.joints.names)} names, but the gains are for {self.controller.lanes} lanes: "
                 "give kp one value per joint"
             )
         self.session = Session(self.controller, self.joints)
-        options = self.values_of(["setpoint", "output_timeout"])
-        self.checked(options)
-        self.changed(options)
+        self.checked(given)
+        self.changed({name: given[name] for name in ("setpoint", "output_timeout")})
         self.accept_changes()
-
-    def _declare_options(self) -> None:
-        declare = self.declare_value
-        declare("setpoint", 0.0, "setpoint until one arrives on the topic")
-        declare("hold_output", False, "true: when activated, the setpoint is the first output, until another is given")
-        declare("output_timeout", 0.5, "s of wall time without output until it is reported; then no jump; 0: never")
-        declare("save_i_term", True, "keep the integral action while inactive")
-        declare(
-            "joint_names", [""], "joints of output and setpoint that are the lanes; none: all, in order", fixed=True
-        )
-        self.declare_timing("control_effort", "output")
 
     def activate(self) -> None:
         """Create topics, services and timers."""
@@ -226,22 +183,19 @@ class ControllerNode(LoopEnd):
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         gains, _ = self._configured(changes)
-        setpoint = self._setpoint(changes["setpoint"]) if "setpoint" in changes else self.session.setpoint
+        setpoint = np.atleast_1d(changes["setpoint"]) if "setpoint" in changes else self.session.setpoint
         if len(setpoint) not in (1, gains.lanes):
             raise ValueError(
                 f"the setpoint has {len(setpoint)} values, but the gains are for {gains.lanes} lanes: give one, or "
                 "one per lane"
             )
-        p = {**self.values_of(list(RANGES)), **changes}
-        for name, (low, high) in RANGES.items():
-            number(name, p[name], low, high)
 
     def changed(self, changes: dict[str, Any]) -> None:
         """Take over accepted changes."""
-        if any(name in DESCRIPTIONS for name in changes):
+        if changes.keys() & (GAINS.keys() | OPTIONS.keys()):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
-            self.session.set_setpoint(self._setpoint(changes["setpoint"]))
+            self.session.set_setpoint(np.atleast_1d(changes["setpoint"]))
         if "output_timeout" in changes:
             self.session.timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
 
@@ -265,10 +219,6 @@ class ControllerNode(LoopEnd):
     def _answers_live_outputs(self) -> bool:
         """Whether it is in a loop in realtime, whose number of lanes is not ours to change."""
         return self.active and self.session.is_live and not self.session.silent
-
-    def _setpoint(self, value: Any) -> np.ndarray:
-        one_per_lane = value if isinstance(value, list) else [value]
-        return np.array([number("setpoint", one, -LARGEST_SIGNAL, LARGEST_SIGNAL) for one in one_per_lane])
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""

@@ -20,9 +20,10 @@ from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, number, run_node
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, run_node
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameters import REPLAY
 from tdof_npid_ros.wire import SECOND, AnswerLabel, Sample
 
 CLOCK = "/clock"
@@ -43,17 +44,10 @@ class ReplayNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__("replay")
-        declare = self.declare_value
-        self.bag = Path(str(declare("bag", "", "the bag to publish again", fixed=True)))
-        self.rate = number("rate", declare("rate", 1.0, "times the recorded speed, above 0", fixed=True), low=1e-6)
-        self.start = number("start", declare("start", 0.0, "s of the recording to leave out", fixed=True), low=0.0)
-        self.loop = bool(declare("loop", False, "begin again at the end", fixed=True))
-        self.clock = bool(
-            declare("clock", False, "publish /clock, as recorded, else the time of recording", fixed=True)
-        )
-        self.compare = bool(
-            declare("compare", False, "compare a live controller's efforts with the recorded", fixed=True)
-        )
+        given = self.declare_all(REPLAY)
+        self.bag = Path(given["bag"])
+        self.rate, self.start = given["rate"], given["start"]
+        self.loop, self.clock, self.compare = given["loop"], given["clock"], given["compare"]
         self.accept_changes()
         try:
             self.reader = BagReader(self.bag)

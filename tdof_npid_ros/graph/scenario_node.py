@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -13,10 +14,10 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.case import read_episodes, sample_period_in_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, number, run_node
-from tdof_npid_ros.scenario import Plan, parse_plan
+from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, run_node
+from tdof_npid_ros.parameters import PLAN, SCENARIO, sample_period_in_ns
+from tdof_npid_ros.scenario import Plan, parse_plan, read_episodes
 
 PLANT = "plant."  # what begins the name of a plant's parameter in a plan
 ASK_AGAIN_NS = 300_000_000  # an answer is lost if the plant has not found this node yet
@@ -32,22 +33,11 @@ class ScenarioNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__("scenario")
-        self.period_ns = sample_period_in_ns(
-            self.declare_value("sample_period", 0.01, "s; time of one step", fixed=True)
-        )
-        self.mode = self.declare_value("mode", "realtime", "lockstep or realtime, as the plant", fixed=True)
-        if self.mode not in ("lockstep", "realtime"):
-            raise ValueError(f"mode is {self.mode!r}: it must be one of lockstep, realtime")
-        speed = self.declare_value("speed", 1.0, "realtime: simulated seconds per wall-clock second", fixed=True)
-        self.speed = number("speed", speed, 1e-3, 1e3)
-        self.play_at_start = bool(
-            self.declare_value("play", True, "play all episodes at the start; else at scenario/play", fixed=True)
-        )
-        self.declare_value("episodes", ["setpoint"], "names of the episodes, in the order in which they are played")
-        for name in self.values_of(["episodes"])["episodes"]:
-            self.declare_value(
-                f"plan.{name}", ["0 setpoint 1", "10 end"], f"lines of the episode {name}: TIME SIGNAL WHAT"
-            )
+        given = self.declare_all(SCENARIO)
+        self.period_ns = sample_period_in_ns(given["sample_period"])
+        self.mode, self.speed, self.play_at_start = given["mode"], given["speed"], given["play"]
+        for name in given["episodes"]:
+            self.declare(replace(PLAN, name=f"{PLAN.name}{name}"))
         self._read_plans({})
         self.accept_changes()
         self.played = 0
@@ -237,7 +227,7 @@ class ScenarioNode(LoopNode):
 
     def _read_plans(self, changes: dict[str, Any]) -> None:
         names = changes.get("episodes", self.values_of(["episodes"])["episodes"])
-        declared = [f"plan.{name}" for name in names]
+        declared = [f"{PLAN.name}{name}" for name in names]
         for name in declared:
             if not self.has_parameter(name):
                 raise ValueError(f"{name} was not there at the start: start the scenario with its episode in episodes")

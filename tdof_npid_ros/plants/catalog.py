@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameter import Parameter, ParameterError, check_limits
+from tdof_npid_ros.parameters import MODELS, OFFSETS, PLANT
 from tdof_npid_ros.plants.linear import TransferFunction
-from tdof_npid_ros.plants.ode import Ode, Sprott, load_class, loaded_class
+from tdof_npid_ros.plants.ode import Ode, Sprott, class_table, load_class, loaded_class
 from tdof_npid_ros.plants.plant import Plant, PlantError
 
-OFFSETS = {"output_offset": 0.0, "effort_offset": 0.0}  # a linear model's operating point
 
-# Parameters of each model and their defaults; the equation is the paper's.
-MODELS: dict[str, dict[str, float | list[float]]] = {
-    "first_order": {"gain": 1.0, "time_constant": 5.0, "dead_time": 0.5, **OFFSETS},  # (11)
-    "second_order": {"gain": 1.0, "time_constant": 2.0, "dead_time": 1.0, **OFFSETS},  # (12), both time constants
-    "third_order": {"gain": 1.0, "time_constant": 1.0, "zero_time_constant": 1.0, "dead_time": 0.0, **OFFSETS},  # (13)
-    "transfer_function": {"numerator": [1.0], "denominator": [1.0, 1.0], "dead_time": 0.0, **OFFSETS},
-    "sprott": {"a": 0.6, "b": 1.2, "c": 2.0, "initial_state": [0.0, 0.0, 0.0]},  # (14)-(16)
-}
-FIXED_WHILE_RUNNING = (
-    "dead_time",
-    "output_offset",
-    "effort_offset",
-    "initial_state",
-    "substeps",
-    "numerator",
-    "denominator",
-)
+def model_table(model: str) -> dict[str, Parameter]:
+    """The parameters of a model, by name.
+
+    Raises:
+        PlantError: no such model, or a class that the user has not named (`named_model`).
+    """
+    if ":" in model:
+        return class_table(loaded_class(model))
+    if model not in MODELS:
+        raise PlantError(
+            f"model {one_line(model, 100)!r} is unknown: take one of {', '.join(MODELS)}, or package.module:Class"
+        )
+    return MODELS[model]
 
 
 def named_model(value: Any, folder: Path | None = None) -> str:
@@ -42,7 +38,7 @@ def named_model(value: Any, folder: Path | None = None) -> str:
     model = str(value)
     if ":" in model:
         load_class(model, folder)
-    model_parameters(model)
+    model_table(model)
     return model
 
 
@@ -52,18 +48,35 @@ def model_parameters(model: str) -> dict[str, float | list[float]]:
     Raises:
         PlantError: no such model, or a class that the user has not named (`named_model`).
     """
-    if ":" in model:
-        description = loaded_class(model)
-        return {
-            **{name: float(value) for name, value in description.parameters.items()},
-            "initial_state": list(map(float, description.initial_state)),
-            "substeps": 1.0,
-        }
-    if model not in MODELS:
-        raise PlantError(
-            f"model {one_line(model, 100)!r} is unknown: take one of {', '.join(MODELS)}, or package.module:Class"
-        )
-    return dict(MODELS[model])
+    return {name: parameter.default for name, parameter in model_table(model).items()}
+
+
+def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters of a model that may change while the loop runs, with their values.
+
+    Args:
+        values: as configured; what is not given has its default.
+
+    Raises:
+        PlantError: no such model.
+    """
+    its = model_table(model).items()
+    return {name: float(values.get(name, one.default)) for name, one in its if not (one.fixed or one.is_list)}
+
+
+def effort_limits(values: Mapping[str, Any]) -> tuple[float, float]:
+    """The actuator's lower and upper limit, from a plant's parameters.
+
+    Raises:
+        PlantError: a limit is no number, or no finite effort lies between them.
+    """
+    try:
+        limits = (PLANT["effort_min"], PLANT["effort_max"])
+        low, high = (limit.checked(values.get(limit.name, limit.default)) for limit in limits)
+        check_limits("effort_min", low, "effort_max", high)
+    except ParameterError as error:
+        raise PlantError(str(error)) from None
+    return low, high
 
 
 def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
@@ -72,7 +85,11 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     Raises:
         PlantError: no such model, or a parameter of the wrong type or range.
     """
-    p = {name: _typed(name, values.get(name, default), default) for name, default in model_parameters(model).items()}
+    its = model_table(model).items()
+    try:
+        p = {name: parameter.checked(values.get(name, parameter.default)) for name, parameter in its}
+    except ParameterError as error:
+        raise PlantError(str(error)) from None
     if ":" in model:
         initial_state, substeps = p.pop("initial_state"), p.pop("substeps")
         return Ode(loaded_class(model), p, tuple(initial_state), substeps)
@@ -81,29 +98,10 @@ def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     offsets = {name: p[name] for name in OFFSETS}
     if model == "transfer_function":
         return TransferFunction(tuple(p["numerator"]), tuple(p["denominator"]), p["dead_time"], **offsets)
-    t = _positive("time_constant", p["time_constant"])
+    t = p["time_constant"]
     if model == "first_order":
         return TransferFunction((p["gain"],), (t, 1.0), p["dead_time"], **offsets)
     if model == "second_order":
         return TransferFunction((p["gain"],), (t * t, 2.0 * t, 1.0), p["dead_time"], **offsets)
     k, c = p["gain"], p["zero_time_constant"]
     return TransferFunction((-k * c, k), (t * t * t, 3.0 * t * t, 3.0 * t, 1.0), p["dead_time"], **offsets)
-
-
-def _typed(name: str, value: Any, default: float | list[float]) -> Any:
-    numbers = (
-        list(value)
-        if isinstance(default, list) and not isinstance(value, (str, bytes)) and hasattr(value, "__len__")
-        else [value]
-    )
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
-            wanted = "a list of finite numbers" if isinstance(default, list) else "a finite number"
-            raise PlantError(f"{name} is {value!r}: it must be {wanted}")
-    return [float(number) for number in numbers] if isinstance(default, list) else float(value)
-
-
-def _positive(name: str, value: float) -> float:
-    if value <= 0:
-        raise PlantError(f"{name} is {value}: it must be above 0")
-    return value

@@ -10,12 +10,15 @@ from functools import lru_cache
 
 import mpmath
 
+from tdof_npid_ros.parameter import ParameterError
+from tdof_npid_ros.parameters import MODELS, OFFSETS
 from tdof_npid_ros.plants.kernels import SampledLinear, SampledOffset
 from tdof_npid_ros.plants.plant import PlantError, nanoseconds
 
+_LINEAR = MODELS["transfer_function"]
+
 DIGITS = 50  # of the matrix exponential: its entries, rounded, are the same doubles on every processor
 
-LONGEST_DEAD_TIME = 1e9  # s
 LARGEST_ORDER = 20  # a step is compiled for its order: this one takes a minute
 MOST_DELAY = 1_000_000  # samples: what a lane's efforts on their way take of memory is 8 MB
 
@@ -43,9 +46,9 @@ class TransferFunction:
 
     numerator: tuple[float, ...]
     denominator: tuple[float, ...]
-    dead_time: float = 0.0
-    output_offset: float = 0.0
-    effort_offset: float = 0.0
+    dead_time: float = _LINEAR["dead_time"].default
+    output_offset: float = _LINEAR["output_offset"].default
+    effort_offset: float = _LINEAR["effort_offset"].default
     start: float | None = None
 
     def __post_init__(self) -> None:
@@ -60,11 +63,11 @@ class TransferFunction:
             raise PlantError(
                 f"denominator is of degree {len(self.denominator) - 1}: it must be {LARGEST_ORDER} or less"
             )
-        for name in ("output_offset", "effort_offset"):
-            if not math.isfinite(getattr(self, name)):
-                raise PlantError(f"{name} is {getattr(self, name)}: it must be finite")
-        if not 0 <= self.dead_time <= LONGEST_DEAD_TIME:
-            raise PlantError(f"dead_time is {self.dead_time} s: it must be from 0 to {LONGEST_DEAD_TIME:g}")
+        try:
+            for name in ("dead_time", *OFFSETS):
+                object.__setattr__(self, name, _LINEAR[name].checked(getattr(self, name)))
+        except ParameterError as error:
+            raise PlantError(str(error)) from None
 
     @property
     def initial_state(self) -> tuple[float, ...]:

@@ -19,9 +19,12 @@ import numba
 import numpy as np
 
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameter import FINITE, Parameter, ParameterError, Range, table
+from tdof_npid_ros.parameters import MODELS, SUBSTEPS
 from tdof_npid_ros.plants.kernels import SampledOde, SampledSprott, sprott_derivative
 from tdof_npid_ros.plants.plant import PlantError
 
+_SPROTT = MODELS["sprott"]
 State = tuple[float, ...]
 RESTING = 1e-9  # largest |dx/dt|, relative to the state's size, at which a plant counts as at rest
 
@@ -34,17 +37,19 @@ class Sprott:
     stretch is of order 1e-13 a second, and a sign change inside a step shifts x3 by less than 2·c·1 ms.
     """
 
-    a: float = 0.6
-    b: float = 1.2
-    c: float = 2.0
-    initial_state: tuple[float, ...] = (0.0, 0.0, 0.0)
+    a: float = _SPROTT["a"].default
+    b: float = _SPROTT["b"].default
+    c: float = _SPROTT["c"].default
+    initial_state: tuple[float, ...] = tuple(_SPROTT["initial_state"].default)
     initial_effort: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("a", "b", "c"):
-            if not math.isfinite(getattr(self, name)):
-                raise PlantError(f"{name} is {getattr(self, name)}: it must be finite")
-        object.__setattr__(self, "initial_state", _state(self.initial_state, 3))
+        try:
+            for name in ("a", "b", "c"):
+                object.__setattr__(self, name, _SPROTT[name].checked(getattr(self, name)))
+            object.__setattr__(self, "initial_state", tuple(_SPROTT["initial_state"].checked(self.initial_state)))
+        except ParameterError as error:
+            raise PlantError(str(error)) from None
 
     @property
     def initial_output(self) -> float:
@@ -68,7 +73,7 @@ class Sprott:
 
     def sampled(self, sample_period_ns: int) -> SampledSprott:
         """The plant as the closed loop steps it."""
-        return SampledSprott(float(self.a), float(self.b), float(self.c), sample_period_ns / 1e9, 0)
+        return SampledSprott(self.a, self.b, self.c, sample_period_ns / 1e9, 0)
 
 
 class Ode:
@@ -85,14 +90,13 @@ class Ode:
     def __init__(
         self, description: type, values: Mapping[str, float], initial_state: tuple[float, ...], substeps: float
     ):
-        if substeps < 1 or substeps != int(substeps):
-            raise PlantError(
-                f"substeps is {substeps:g}: the integration takes a whole number of steps a sample, 1 or more"
-            )
+        try:
+            self.substeps = int(SUBSTEPS.checked(substeps))
+        except ParameterError as error:
+            raise PlantError(str(error)) from None
         self.description = description
         self.values = tuple(float(value) for value in values.values())
         self.initial_state = _state(initial_state, len(initial_state))
-        self.substeps = int(substeps)
         self._derivative = _compiled(description.derivative)  # type: ignore[attr-defined]
         self._output = _compiled(description.output)  # type: ignore[attr-defined]
         self.initial_effort = 0.0
@@ -247,6 +251,44 @@ def _check_description(path: str, found: Any) -> None:
         raise PlantError(f"{path}.parameters is {found.parameters!r}: it must map names to finite numbers")
     if not isinstance(found.initial_state, (tuple, list)) or not all(map(_is_number, found.initial_state)):
         raise PlantError(f"{path}.initial_state is {found.initial_state!r}: it must be a tuple of finite numbers")
+    for attribute in ("descriptions", "ranges"):
+        about = getattr(found, attribute, {})
+        if not isinstance(about, Mapping) or not about.keys() <= found.parameters.keys():
+            raise PlantError(f"{path}.{attribute} is {about!r}: it must map names of parameters")
+    _ = class_table(found)
+
+
+def class_table(description: Any) -> dict[str, Parameter]:
+    """The parameters that a user's class brings, with its optional `descriptions` and `ranges`, by name.
+
+    Raises:
+        PlantError: a range is no [lower, upper], or its default lies outside.
+    """
+    texts, ranges = getattr(description, "descriptions", {}), getattr(description, "ranges", {})
+    parameters = [
+        Parameter(
+            name,
+            float(value),
+            str(texts.get(name, f"parameter of {description.__qualname__}")),
+            within=_range(name, ranges[name]) if name in ranges else FINITE,
+        )
+        for name, value in description.parameters.items()
+    ]
+    start = Parameter("initial_state", list(map(float, description.initial_state)), "x at time 0", "", FINITE)
+    start = replace(start, fixed=True, length=len(start.default))
+    try:
+        for parameter in parameters:
+            parameter.checked(parameter.default)
+    except ParameterError as error:
+        raise PlantError(f"{description.__qualname__}.parameters: {error}") from None
+    return table(*parameters, start, SUBSTEPS)
+
+
+def _range(name: str, ends: Any) -> Range:
+    if not isinstance(ends, (tuple, list)) or len(ends) != 2 or not all(isinstance(end, (int, float)) for end in ends):
+        raise PlantError(f"ranges[{name!r}] is {ends!r}: it must be (lower, upper)")
+    low, high = map(float, ends)
+    return Range(low, high, math.isfinite(low), math.isfinite(high))
 
 
 def _is_number(value: Any) -> bool:

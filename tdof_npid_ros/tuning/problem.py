@@ -10,6 +10,8 @@ import numpy as np
 
 from tdof_npid_ros.case import Bounds, Case
 from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains, GainsError
+from tdof_npid_ros.parameter import ParameterError
+from tdof_npid_ros.parameters import TUNER, WEIGHT
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -20,14 +22,8 @@ EPISODES = ("setpoint", "disturbance")
 POPULATION, GENERATIONS = 40, 200
 """By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""
 
-LARGEST_POPULATION = 100_000
-"""Candidates in memory at once."""
-
 LARGEST_BUDGET = 10**12
 """Evaluations: more than a year of them."""
-
-LARGEST_WEIGHT = 1e100
-"""So that the objective (10) stays finite."""
 
 POLISH = 6
 """By default: candidates in each step of the HGA's polish, for the fewest evaluations."""
@@ -54,7 +50,7 @@ class TuningProblem:
     case: Case
     controller: ControllerType
     extra: tuple[str, ...] = ()
-    weight: float = 1.0
+    weight: float = WEIGHT.default
     algorithm: str = "hga"
     seed: int = 0
     population: int = POPULATION
@@ -62,11 +58,13 @@ class TuningProblem:
     polish: int = POLISH
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.weight <= LARGEST_WEIGHT:
-            raise TuningError(f"weight is {self.weight}: it must be a number from 0 to {LARGEST_WEIGHT:g}")
-        for name in ("population", "polish"):
-            if getattr(self, name) > LARGEST_POPULATION:
-                raise TuningError(f"{name} is {getattr(self, name):g}: it must be {LARGEST_POPULATION} or less")
+        try:
+            WEIGHT.checked(self.weight)
+        except ParameterError as error:
+            raise TuningError(str(error)) from None
+        for name in ("population", "polish"):  # the optimiser checks the rest
+            if getattr(self, name) > (most := TUNER[name].within.high):
+                raise TuningError(f"{name} is {getattr(self, name):g}: it must be {most:.0f} or less")
         if self.population * self.generations > LARGEST_BUDGET:
             raise TuningError(f"population times generations must be {LARGEST_BUDGET:g} evaluations or less")
         if self.extra not in ((), ("sigma",)) or (self.extra and self.controller == "pid"):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tdof_npid_ros.case import config_folder, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.paper.tables import CASES
-from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters, write_parameters
+from tdof_npid_ros.parameter_file import ParameterFileError, config_folder, read_parameters, write_parameters
 
 
 def simulated(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, object]:

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 import yaml
 
-from tdof_npid_ros.case import config_folder, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
-from tdof_npid_ros.parameter_file import write_parameters
+from tdof_npid_ros.parameter_file import config_folder, write_parameters
 from tdof_npid_ros.tuning.study import tune_case
 
 QUICK = ["p3-c1", "--population", "10", "--generations", "5", "--seed", "2"]

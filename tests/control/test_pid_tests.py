@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from tdof_npid_ros.case import sample_period_in_ns
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import AntiWindup, Gains, GainsError
 from tdof_npid_ros.control.law import TERMS, tracking_time
 from tdof_npid_ros.control.session import OutputSequence, Place
+from tdof_npid_ros.parameters import sample_period_in_ns
 
 H = 1.0  # s: as there, so that an error of 1 adds ki to the integral action
 PERIOD_NS = 1_000_000_000

@@ -68,15 +68,22 @@ class NodeProcess:
     """A node in a process of its own; what it prints is in `log`."""
 
     def __init__(
-        self, node: str, arguments: Sequence[str], environment: dict[str, str], log: Path, cwd: Path = REPOSITORY
+        self,
+        node: str,
+        arguments: Sequence[str],
+        environment: dict[str, str],
+        log: Path,
+        cwd: Path = REPOSITORY,
+        program: str = "",
     ) -> None:
+        """Args: program: Python that runs it; empty: ours."""
         self.node = node
         self._log = log
         self.expected_status: int | None = 0
         self.stopped = False
         with log.open("w") as stream:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "tdof_npid_ros.graph", node, *arguments],
+                [sys.executable, *(["-c", program] if program else ["-m", "tdof_npid_ros.graph", node]), *arguments],
                 stdout=stream,
                 stderr=subprocess.STDOUT,
                 cwd=cwd,
@@ -184,6 +191,7 @@ class Graph:
         case: str = "",
         namespace: str = "",
         cwd: Path = REPOSITORY,
+        program: str = "",
         **parameters: Any,
     ) -> NodeProcess:
         """Start a node.
@@ -193,6 +201,7 @@ class Graph:
             case: name of a file in config/, or a path, whose parameters it gets.
             namespace: to start it in.
             cwd: folder to start it in.
+            program: Python that runs it, in place of ours.
             parameters: after those of the case; dots in names as double underscores.
         """
         values = dict(parameters)
@@ -207,7 +216,7 @@ class Graph:
             write_parameters(file, {node: {name.replace("__", "."): plain(value) for name, value in values.items()}})
             command += ["--params-file", str(file)]
         log = self.folder / f"{node}-{len(self.processes)}.log"
-        process = NodeProcess(node, command, self.environment, log, cwd)
+        process = NodeProcess(node, command, self.environment, log, cwd, program)
         self.processes.append(process)
         return process
 

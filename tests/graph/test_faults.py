@@ -19,7 +19,7 @@ import pytest
 from test_operation import CONTROLLER, PLANT, Live
 
 from tdof_npid_ros.analysis.verify import verify
-from tdof_npid_ros.graph.runtime.node import as_float, first
+from tdof_npid_ros.graph.runtime.node import as_float
 
 BOUND = 0.5  # of the setpoint: how far the output may go in any of these faults, but for the loss of the plant itself
 JUMP = 0.25  # largest step of the effort between two samples while parameters change at random
@@ -269,7 +269,8 @@ def test_random_parameters_of_every_node_are_accepted_or_refused_whole(graph: An
         after = graph.get_parameters(name, *names)
         for one, was, now in zip(names, before, after, strict=True):
             expected = changes[one] if result.successful and one in changes else was
-            expected = as_float(expected) if isinstance(first(was), float) else expected  # 3 is taken as 3.0
+            is_float = isinstance(was[0] if isinstance(was, list) and was else was, float)
+            expected = as_float(expected) if is_float else expected  # 3 is taken as 3.0
             assert same(now, expected), (changes, one, was, now, process.log)
         assert result.successful or result.reason
 

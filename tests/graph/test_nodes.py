@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdof_npid_ros.case import config_folder, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.options import ControllerOptions
-from tdof_npid_ros.parameters import OF_ANY_NODE, OF_NODE, WITH_ANY_END
-from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.parameter_file import config_folder
+from tdof_npid_ros.parameters import NODES, OF_ROS, PLAN
+from tdof_npid_ros.plants.catalog import model_table
 from tdof_npid_ros.scenario import parse_plan
 
 AT_ONCE = 2.5  # s; some 0.3 s on a quiet machine
@@ -274,19 +275,56 @@ def test_a_misspelt_parameter_is_warned_of(graph: Any, tmp_path: Path) -> None:
     graph.wait_for_log(tuner, warning)
 
 
-def test_the_names_that_no_node_warns_of_are_the_parameters_that_the_nodes_have(graph: Any) -> None:
-    from rcl_interfaces.srv import ListParameters
+@pytest.mark.parametrize("node", NODES)
+def test_a_node_declares_its_table_and_describes_it(graph: Any, node: str, tmp_path: Path) -> None:
+    from rcl_interfaces.msg import ParameterType
+    from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 
-    seen: set[str] = set()
-    for node, its in OF_NODE.items():
-        graph.start(node, *(["-p", "case:=p1-c4"] if node == "tuner" else []), autostart=False)
-        graph.wait_for_nodes(f"/{node}")
-        listed = graph.call(f"/{node}/list_parameters", ListParameters, ListParameters.Request(), again=True)
-        names = {name for name in listed.result.names if not name.startswith(WITH_ANY_END)}
-        model = set(model_parameters("first_order")) if node == "plant" else set()
-        assert names - set(OF_ANY_NODE) == set(its) | model
-        seen |= names
-    assert seen >= set(OF_ANY_NODE)
+    given = {"tuner": "case:=p1-c4", "replay": "bag:=bags/sample", "recorder": f"bag:={tmp_path / 'bag'}"}.get(node)
+    graph.start(node, *(["-p", given] if given else []), autostart=False)
+    graph.wait_for_nodes(f"/{node}")
+    listed = graph.call(f"/{node}/list_parameters", ListParameters, ListParameters.Request(), again=True)
+    model = model_table("first_order") if node == "plant" else {}
+    table = {**NODES[node], **model}
+    names = [name for name in listed.result.names if not name.startswith(OF_ROS) and not name.startswith(PLAN.name)]
+    assert set(names) == table.keys()
+    described = graph.call(
+        f"/{node}/describe_parameters", DescribeParameters, DescribeParameters.Request(names=names), again=True
+    )
+    values = graph.call(f"/{node}/get_parameters", GetParameters, GetParameters.Request(names=names), again=True)
+    for name, found, value in zip(names, described.descriptors, values.values, strict=True):
+        parameter = table[name]
+        assert parameter.description in found.description
+        assert found.additional_constraints == parameter.constraints
+        assert found.read_only == parameter.fixed
+        assert found.type == value.type != ParameterType.PARAMETER_NOT_SET
+        ranges = found.floating_point_range or found.integer_range
+        assert bool(ranges) == parameter.is_slider
+        assert not ranges or (ranges[0].from_value, ranges[0].to_value) == parameter.within[:2]
+
+
+ADDED = """
+import sys
+from tdof_npid_ros import parameters
+from tdof_npid_ros.parameter import Parameter, Range
+
+parameters.SCENARIO["patience"] = Parameter("patience", 1.5, "how long it waits", "s", Range(0.0, 9.0))
+from tdof_npid_ros.graph.__main__ import run
+
+run("scenario", ["scenario", *sys.argv[1:]])
+"""
+
+
+def test_a_parameter_added_to_the_table_alone_is_declared_and_checked(graph: Any) -> None:
+    graph.start("scenario", "-p", "patience:=3", program=ADDED, autostart=False)
+    graph.wait_for_nodes("/scenario")
+    assert graph.get_parameters("/scenario", "patience") == [3]
+    (result,) = graph.set_parameters("/scenario", patience=10.0)
+    assert result.reason == "patience is 10.0: it must be a number from 0 to 9, in s"
+    (result,) = graph.set_parameters("/scenario", patience=4)
+    assert result.successful
+    assert graph.get_parameters("/scenario", "patience") == [4.0]
+    assert graph.fresh_fact("/scenario", "refused_parameters", 0) == "1"
 
 
 def test_what_a_plant_cannot_do_is_refused_and_it_goes_on(graph: Any) -> None:

@@ -11,12 +11,11 @@ import numpy as np
 from diagnostic_msgs.msg import KeyValue
 from sensor_msgs.msg import JointState
 
-from tdof_npid_ros.case import changeable_parameters
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
 from tdof_npid_ros.graph.runtime.messages import lane_names
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
-from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
@@ -123,10 +122,9 @@ class PlantPort:
 
     def new_simulator(self) -> PlantSimulator:
         """The plant at its initial state, with the parameters as they are now."""
-        lanes = int(self.node.values_of(["lanes"])["lanes"])
+        lanes = self.node.values_of(["lanes"])["lanes"]
         return PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""
-        p = self.node.values_of(["effort_min", "effort_max"])
-        return float(p["effort_min"]), float(p["effort_max"])
+        return effort_limits(self.node.values_of(["effort_min", "effort_max"]))

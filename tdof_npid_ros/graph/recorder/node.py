@@ -24,23 +24,22 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.bag import BagError, schema
 from tdof_npid_ros.bag.cdr import without_padding
-from tdof_npid_ros.bag.file_writer import COMPRESSIONS
 from tdof_npid_ros.bag.metadata import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
-from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, number, run_node
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, run_node
 from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameters import RECORDER
 from tdof_npid_ros.wire import JOINT_STATE
 
 DISCOVERY_PERIOD = 0.1  # s between two looks at the graph, as long as it changes
 CALM_DISCOVERY_PERIOD = 0.5  # s, when it does not
 CALM_LOOKS = 20  # looks without a change
 PARAMETER_EVENTS = "/parameter_events"
-EVERYTHING = ["*", PARAMETER_EVENTS, "/rosout", "/diagnostics", "/clock"]
 # The loop's own topics are subscribed before their publishers come, so that not even the first message is missed.
 EXPECTED = {
     "output": JOINT_STATE,
@@ -64,37 +63,12 @@ class RecorderNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__("recorder")
-        default = f"bags/{time.strftime('%Y%m%d-%H%M%S')}"
-        bag = self.declare_value("bag", default, "folder of the bag; must not exist; not to be changed while recording")
-        self.folder = self._folder(bag)
-        self.compression = self.declare_value(
-            "compression", "zstd", f"of the chunks: {', '.join(COMPRESSIONS)}", fixed=True
-        )
-        self.max_bytes = round(
-            number(
-                "max_bytes",
-                self.declare_value("max_bytes", 0, "a new file begins at this size; 0: never", fixed=True),
-                low=0.0,
-            )
-        )
-        self.max_duration = number(
-            "max_duration",
-            self.declare_value("max_duration", 0.0, "s; a new file begins after this time; 0: never", fixed=True),
-            low=0.0,
-        )
-        self.topics = _patterns(
-            self.declare_value(
-                "topics",
-                EVERYTHING,
-                "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this "
-                "namespace",
-                fixed=True,
-            )
-        )
-        self.exclude = _patterns(self.declare_value("exclude", [""], "patterns of topics to leave out", fixed=True))
-        self.lossless = self.declare_value(
-            "lossless", False, "tell the plant on `recorded` how far the log is; the plant needs it, too", fixed=True
-        )
+        given = self.declare_all(RECORDER, bag=f"bags/{time.strftime('%Y%m%d-%H%M%S')}")
+        self.folder = self._folder(given["bag"])
+        self.compression = given["compression"]
+        self.max_bytes, self.max_duration = given["max_bytes"], given["max_duration"]
+        self.topics, self.exclude = given["topics"], given["exclude"]
+        self.lossless = given["lossless"]
         self.accept_changes()
         self._begin_account()
         self.taps: dict[str, Tap] = {}
@@ -339,10 +313,6 @@ class RecorderNode(LoopNode):
             worst = losses.most_common(1)[0][0]
             return WARN, f"{losses.total()} messages lost, most on {worst}: set lossless, or leave topics out", facts
         return OK, f"recording {len(self.taps)} topics to {self.folder}", facts
-
-
-def _patterns(value: str | list[str]) -> list[str]:
-    return [value] if isinstance(value, str) else list(value)
 
 
 def _recordable(types: list[str]) -> str:

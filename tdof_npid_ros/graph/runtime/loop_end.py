@@ -11,7 +11,6 @@ from tdof_npid_ros.graph.runtime.node import RECENT, RECENT_QOS, LoopNode
 from tdof_npid_ros.graph.runtime.realtime import prepare_for_realtime
 
 PATIENCE_PERIODS = 3  # without a signal: no silence yet, however slow the loop
-TIMING_RANGES = {"deadline": (0.0, 3600.0), "lease": (0.0, 3600.0)}  # s
 
 
 def patience_ns(timeout: float, period_ns: int) -> int:
@@ -25,22 +24,6 @@ class LoopEnd(LoopNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         all_within(np.zeros(1), 1.0)  # compiles
-
-    def declare_timing(self, published: str, taken: str) -> None:
-        """Declare the parameters of what the topic `published` promises, `taken` has to, and the processor allows."""
-        declare = self.declare_value
-        declare(
-            "deadline", 0.0, f"realtime: s from one {published} to the next, as it promises; 0: no promise", fixed=True
-        )
-        declare("lease", 1.0, f"s; lease of the liveliness that {published} promises; 0: no promise", fixed=True)
-        declare(
-            "request_deadline",
-            False,
-            f"realtime: take {taken} only from publishers that promise this deadline and lease",
-            fixed=True,
-        )
-        declare("priority", 0, "priority of SCHED_FIFO, 1 to 99; 0: normal scheduling", fixed=True)
-        declare("cpu", -1, "number of the processor to stay on; -1: any", fixed=True)
 
     def prepare_for_realtime(self) -> None:
         """Take the priority and the processor asked for; log what the system does not allow."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from tdof_npid_ros.case import config_folder
+from tdof_npid_ros.parameter_file import config_folder
 
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable
 

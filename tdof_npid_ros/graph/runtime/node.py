@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import functools
-import math
 import signal
 import socket
 import sys
@@ -15,11 +15,11 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
@@ -31,7 +31,8 @@ from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.runtime.own_services import guard_services
 from tdof_npid_ros.graph.runtime.realtime import collect_garbage
 from tdof_npid_ros.one_line import one_line
-from tdof_npid_ros.parameters import unknown_parameters
+from tdof_npid_ros.parameter import Parameter, Table, infinity_as_float
+from tdof_npid_ros.parameters import AUTOSTART, misspelt
 from tdof_npid_ros.wire import Sample, SignalReader
 
 SIGNAL_QOS = signal_qos(1000)
@@ -61,7 +62,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._activating = False
         self._activation = 0  # how often it has been activated
         self.leftovers: list[Callable[[], None]] = []  # how to destroy what ended activations have left
-        self._defaults: dict[str, Any] = {}
+        self._parameters_known: dict[str, Parameter] = {}
         super().__init__(name)
         self.counts: Counter[str] = Counter()
         self.quiet_parameters: set[str] = set()  # changes of them are not logged: they come from a topic
@@ -71,11 +72,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.endpoints = Endpoints(self, self.refuse)
         guard_services(self.services, self.refuse)
         self._warned: set[str] = set()
-        self.autostart = bool(
-            self.declare_value(
-                "autostart", True, "activate at once; false: wait for a supervisor's transitions", fixed=True
-            )
-        )
+        self.autostart = bool(self.declare(AUTOSTART))
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer, clock=STEADY)
 
@@ -177,22 +174,69 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     # Parameters
 
-    def declare_value(self, name: str, default: Any, description: str, *, fixed: bool = False) -> Any:
-        """Declare a parameter and return its value. Its type is checked by the node, so that 10 does for 10.0.
+    def declare_all(self, parameters: Table, **defaults: Any) -> dict[str, Any]:
+        """Declare parameters and return their values, by name; those that are declared already are passed over.
+
+        Args:
+            defaults: in place of the parameters' own, where those depend on something else.
 
         Raises:
-            ValueError: it is of another kind than the default.
+            ParameterError: a value is of the wrong kind, out of its range, or none of the choices.
         """
-        self._defaults[name] = default
-        descriptor = ParameterDescriptor(description=description, read_only=fixed, dynamic_typing=True)
-        value = plain(self.declare_parameter(name, default, descriptor).value)
-        if value is not None or not isinstance(default, list):  # ROS passes an empty list as nothing
-            check_kind(name, as_float(value) if isinstance(first(default), float) else value, default)
-        return value
+        for name, parameter in parameters.items():
+            if name not in self._parameters_known:
+                self.declare(parameter, defaults.get(name))
+        return self.values_of(list(parameters))
+
+    def declare(self, parameter: Parameter, default: Any = None) -> Any:
+        """Declare a parameter and return its value. Its type is checked by the node, so that 10 does for 10.0.
+
+        Args:
+            default: in place of the parameter's own.
+
+        Raises:
+            ParameterError: its value is of the wrong kind, out of its range, or none of the choices.
+        """
+        name = parameter.name
+        self._parameters_known[name] = parameter
+        descriptor = ParameterDescriptor(
+            description=f"{parameter.description} ({parameter.unit})" if parameter.unit else parameter.description,
+            additional_constraints=parameter.constraints,
+            read_only=parameter.fixed,
+            dynamic_typing=True,
+        )
+        self.declare_parameter(name, parameter.default if default is None else default, descriptor)
+        return self.values_of([name])[name]
+
+    def describe_parameter(self, name: str) -> ParameterDescriptor:
+        """As `Node.describe_parameter`, and with the range of the table, for sliders.
+
+        rclpy does not get the range itself: it would refuse by it before `checked`, without a count and with less of a
+        reason.
+        """
+        descriptor = copy.copy(super().describe_parameter(name))
+        parameter = self._parameters_known.get(name)
+        if parameter is not None and parameter.is_slider:
+            low, high = parameter.within.low, parameter.within.high
+            if parameter.kind is int:
+                descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+            else:
+                descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        return descriptor
 
     def values_of(self, names: Sequence[str]) -> dict[str, Any]:
-        """Parameters by name."""
-        return {name: plain(self.get_parameter(name).value) for name in names}
+        """Declared parameters by name, as their table takes them."""
+        values = {name: plain(self.get_parameter(name).value) for name in names}
+        # ROS passes an empty list as nothing.
+        return {
+            name: [] if value is None and self._parameters_known[name].is_list else self._taken(name, value)
+            for name, value in values.items()
+        }
+
+    def _taken(self, name: str, value: Any) -> Any:
+        """A parameter's value as its table takes it; one of ROS's own as it is."""
+        known = self._parameters_known.get(name)
+        return known.checked(value) if known else value
 
     def accept_changes(self) -> None:
         """From now on, parameters may be changed from outside; all are declared."""
@@ -204,25 +248,22 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def _warn_of_unknown_parameters(self) -> None:
         """ROS passes over what a parameter file gives a node that does not know it, a misspelt gain for one."""
         given = (name for name in self._parameter_overrides if not self.has_parameter(name))
-        for warning in unknown_parameters(given, self._defaults):
+        for warning in misspelt(given, self._parameters_known):
             self.get_logger().warning(warning)
 
-    def _as_declared(self, parameters: list[Parameter]) -> list[Parameter]:
+    def _as_declared(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send."""
         return [
-            Parameter(parameter.name, value=as_float(plain(parameter.value)))
-            if isinstance(first(self._defaults.get(parameter.name)), float)
+            RosParameter(parameter.name, value=as_float(plain(parameter.value)))
+            if (its := self._parameters_known.get(parameter.name)) and its.kind is float
             else parameter
             for parameter in parameters
         ]
 
-    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         try:
-            for name, value in changes.items():
-                if name in self._defaults:
-                    check_kind(name, value, self._defaults[name])
-            self.checked(changes)
+            self.checked({name: self._taken(name, value) for name, value in changes.items()})
         except (ValueError, TypeError, ArithmeticError) as error:
             cause = f"parameters {', '.join(changes)} refused"
             if changes.keys() <= self.quiet_parameters:
@@ -234,12 +275,12 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._before = {name: plain(self.get_parameter_or(name).value) for name in changes}
         return SetParametersResult(successful=True)
 
-    def _on_parameters_set(self, parameters: list[Parameter]) -> None:
+    def _on_parameters_set(self, parameters: list[RosParameter]) -> None:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         for name, value in changes.items():
             if name not in self.quiet_parameters:
                 self.get_logger().info(one_line(f"{name}: {self._before.get(name)} -> {value}"))
-        self.changed(changes)
+        self.changed({name: self._taken(name, value) for name, value in changes.items()})
 
     # Reporting
 
@@ -335,49 +376,12 @@ def plain(value: Any) -> Any:
     return list(value) if hasattr(value, "__len__") and not isinstance(value, (str, bytes)) else value
 
 
-def first(value: Any) -> Any:
-    """The first element of a list, or the value itself."""
-    return value[0] if isinstance(value, list) and value else value
-
-
 def as_float(value: Any) -> Any:
     """A whole number, or a word for infinity, as a float, alone or in a list; anything else as it is."""
+    value = infinity_as_float(value)
     if isinstance(value, list):
         return [as_float(one) for one in value]
-    if isinstance(value, str) and value.lower().replace(".", "") in ("inf", "+inf", "-inf"):
-        return float(value.replace(".", ""))
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-KINDS = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "text, in quotes if it looks like a number",
-}
-
-
-def check_kind(name: str, value: Any, default: Any) -> None:
-    """Refuse a value that is of another kind than a parameter's default; a number may become a list, one per lane.
-
-    Raises:
-        ValueError: it is.
-    """
-    kind, is_list = type(first(default)), isinstance(default, list)
-    many = isinstance(value, list) and (is_list or kind is float)
-    if (is_list and not many) or any(type(one) is not kind for one in (value if many else [value])):
-        raise ValueError(f"{name} is {value!r}: it must be {'a list, each of it ' if is_list else ''}{KINDS[kind]}")
-
-
-def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """A parameter that must be a number within low..high.
-
-    Raises:
-        ValueError: it is not.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}: it must be a number from {low:g} to {high:g}")
-    return float(value)
 
 
 def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = None) -> None:

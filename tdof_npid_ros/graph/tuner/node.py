@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
 import threading
@@ -17,8 +16,8 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
-from tdof_npid_ros.case import Case, controller_type, load_case, read_bounds
-from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.case import Case, load_case, read_bounds
+from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.graph.runtime.ending import end_within
 from tdof_npid_ros.graph.runtime.messages import signal_message
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
@@ -32,21 +31,20 @@ from tdof_npid_ros.graph.runtime.node import (
     autostart,
     executor_for,
     ignore_further_signals,
-    number,
 )
 from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
 from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.output_file import check_writable
-from tdof_npid_ros.parameter_file import ParameterFileError, check_replaceable, write_parameters
+from tdof_npid_ros.parameter import ParameterError
+from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
+from tdof_npid_ros.parameters import BOUNDS, TUNER
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
-POPULATION, GENERATIONS = 40, 60  # by default: lanes of a generation, and a run of a minute or two
 POLL = 0.05  # s between two looks for a signal
 FAILURE = 2  # exit status
-EPISODE = ("reset", "alternate")
 
 
 class InterruptedTuningError(RuntimeError):
@@ -82,23 +80,19 @@ class TunerNode(LoopNode):
         self.phase, self.text = "waiting", "waiting for a loop"
         self.stop_requested = self.stop_at_once = False
         self.activated = threading.Event()
-        self.problem = self._declare_problem()
-        self.loops = self.declare_value(
-            "loops", [OWN_LOOP], "namespaces of the loops; . is the tuner's own, * every one on the graph", fixed=True
-        )
-        self.loop_timeout = self._declare_seconds("loop_timeout", 60.0, "s without any loop until the tuner gives up")
-        self.answer_timeout = self._declare_seconds("answer_timeout", 5.0, "s until a silent loop counts as lost")
-        checkpoint = self._declare_path("checkpoint", "file, saved after each generation")
-        resume = self.declare_value("resume", True, "go on from the checkpoint if it is there", fixed=True)
-        self.result_file = self._declare_path("result", "ROS parameter file to write the optimum to")
-        self.step_test = self._declare_step_test()
+        case = self._declared_case()
+        self.problem = self._problem(case)
+        self.loops = self.given["loops"]
+        self.loop_timeout, self.answer_timeout = self.given["loop_timeout"], self.given["answer_timeout"]
+        checkpoint, self.result_file = _path(self.given["checkpoint"]), _path(self.given["result"])
+        self.step_test = self._step_test()
         self.uses_events_executor = self.step_test is not None  # else outputs are tapped, and taps must be left alone
-        self.stay = self.declare_value("stay", False, "stay on the graph when done, instead of ending", fixed=True)
+        self.stay = self.given["stay"]
         if self.result_file is not None:
             check_writable(self.result_file)
             check_replaceable(self.result_file, "controller", Gains().as_dict())
         self.accept_changes()
-        self.study = Study(self.problem, checkpoint, bool(resume))
+        self.study = Study(self.problem, checkpoint, self.given["resume"])
         self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"
 
     def activate(self) -> None:
@@ -123,79 +117,49 @@ class TunerNode(LoopNode):
 
     # Parameters
 
-    def _declare_problem(self) -> TuningProblem:
-        case = self._declare_case()
-        kind = self.declare_value("type", case.gains.type, "controller type to tune", fixed=True)
-        free = self.declare_value("free", "", "what to tune besides the type's gains: sigma, or nothing", fixed=True)
-        weight = self.declare_value("weight", case.weight, "w of IAE_SP + w·IAE_DIS, not below 0", fixed=True)
-        algorithm = self.declare_value("algorithm", "hga", "hga, de or cmaes", fixed=True)
-        seed = self.declare_value("seed", 0, "the same seed gives the same result", fixed=True)
-        population = self.declare_value("population", POPULATION, "candidates, and lanes, of a generation", fixed=True)
-        generations = self.declare_value("generations", GENERATIONS, "of a whole population each", fixed=True)
-        polish = self.declare_value(
-            "polish", population, "hga: candidates in a step of its polish; 0: none", fixed=True
-        )
-        return TuningProblem(
-            case,
-            controller_type(str(kind)),
-            (str(free),) if free else (),
-            number("weight", weight),
-            str(algorithm),
-            seed,
-            population,
-            generations,
-            polish,
-        )
-
-    def _declare_case(self) -> Case:
-        name = str(self.declare_value("case", "", "case to tune (p1-c0.5, …), or its parameter file", fixed=True))
+    def _declared_case(self) -> Case:
+        """The case, with the bounds and the weight that were given to the tuner itself; all is declared."""
+        name = self.declare(TUNER["case"])
         if not name:
-            raise ParameterFileError("the tuner needs its parameter case: a case's name or its parameter file")
+            raise ParameterError("the tuner needs its parameter case: a case's name or its parameter file")
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             case = load_case(name)
         for warning in told:
             self.get_logger().warning(str(warning.message))
-        bounds = {
-            gain: read_bounds(
-                gain, self.declare_value(f"bounds.{gain}", list(its), f"[lower, upper] of {gain}", fixed=True)
-            )
-            for gain in PER_LANE
-            if (its := case.bounds.get(gain))
-        }
-        return replace(case, bounds=bounds)
+        its = {f"bounds.{gain}": list(bounds) for gain, bounds in case.bounds.items()}
+        unbounded = BOUNDS.keys() - its.keys() - self._parameter_overrides.keys()
+        table = {name: parameter for name, parameter in TUNER.items() if name not in unbounded}
+        population = self.declare(TUNER["population"])
+        self.given = self.declare_all(table, type=case.gains.type, weight=case.weight, polish=population, **its)
+        return replace(case, bounds=read_bounds(self.given), weight=self.given["weight"])
 
-    def _declare_step_test(self) -> StepTest | None:
-        """How candidates are tested on a plant that cannot be reset; None for one in lockstep."""
-        episode = self.declare_value("episode", "reset", f"how a candidate is tested: {', '.join(EPISODE)}", fixed=True)
-        if episode not in EPISODE:
-            raise ParameterFileError(f"episode is {episode!r}: it must be one of {', '.join(EPISODE)}")
-        levels = self._declare_pair("levels", [0.0, 1.0], "alternate: the two setpoints")
-        safe_output = self._declare_pair("safe_range.output", [-math.inf, math.inf], "alternate: ends a trial if left")
-        safe_effort = self._declare_pair("safe_range.effort", [-math.inf, math.inf], "alternate: ends a trial if left")
-        settle_band = self.declare_value(
-            "settle_band", 0.02, "alternate: fraction of the step, counts as there", fixed=True
+    def _problem(self, case: Case) -> TuningProblem:
+        given = self.given
+        return TuningProblem(
+            case,
+            given["type"],
+            (given["free"],) if given["free"] else (),
+            case.weight,
+            given["algorithm"],
+            given["seed"],
+            given["population"],
+            given["generations"],
+            given["polish"],
         )
-        settle_time = self._declare_seconds("settle_time", 1.0, "alternate: s within settle_band, counts as settled")
-        time_limit = self._declare_seconds("time_limit", 60.0, "alternate: s in which the output must settle")
-        if episode == "reset":
+
+    def _step_test(self) -> StepTest | None:
+        """How candidates are tested on a plant that cannot be reset; None for one in lockstep."""
+        given = self.given
+        if given["episode"] == "reset":
             return None
         if len(self.loops) != 1 or EVERY_LOOP in self.loops:
-            raise ParameterFileError(f"loops are {self.loops}: episode alternate tunes one loop, name that one")
-        return StepTest(levels, number("settle_band", settle_band), settle_time, time_limit, safe_output, safe_effort)
-
-    def _declare_pair(self, name: str, default: list[float], description: str) -> tuple[float, float]:
-        value = self.declare_value(name, default, description, fixed=True)
-        if not isinstance(value, list) or len(value) != 2:
-            raise ParameterFileError(f"{name} is {value!r}: it must be two numbers")
-        return number(name, value[0]), number(name, value[1])
-
-    def _declare_path(self, name: str, what: str) -> Path | None:
-        value = str(self.declare_value(name, "", f"{what}; empty: none", fixed=True))
-        return Path(value) if value else None
-
-    def _declare_seconds(self, name: str, default: float, description: str) -> float:
-        return number(name, self.declare_value(name, default, description, fixed=True), 0.1, 1e6)
+            raise ParameterError(f"loops are {self.loops}: episode alternate tunes one loop, name that one")
+        levels, safe_output, safe_effort = (
+            (given[name][0], given[name][1]) for name in ("levels", "safe_range.output", "safe_range.effort")
+        )
+        settling = given["settle_band"], given["settle_time"], given["time_limit"]
+        return StepTest(levels, *settling, safe_output, safe_effort)
 
     # The run
 
@@ -298,6 +262,10 @@ class TunerNode(LoopNode):
             facts |= {"generation": study.generation, "evaluations": study.evaluations, "budget": study.budget}
             facts |= {"best": study.best_value, "loops": " ".join(self.evaluator.in_use)}
         return ERROR if self.phase == "failed" else OK, self.text, facts
+
+
+def _path(name: str) -> Path | None:
+    return Path(name) if name else None
 
 
 def main(args: list[str] | None = None) -> None:
