@@ -20,6 +20,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The reference of the parameters, from their tables.
+docs/parameters.md: tdof_npid_ros/parameter.py tdof_npid_ros/parameters.py tdof_npid_ros/reference.py $(VENV)/.run
+	$(BIN)/python -m tdof_npid_ros.reference $@
+
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 

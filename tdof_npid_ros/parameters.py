@@ -219,7 +219,14 @@ def _dead_time(default: float) -> Parameter:
 
 _GAIN: Final = Parameter("gain", 1.0, "gain K of the transfer function", "output per effort unit", FINITE)
 OFFSETS: Final = table(  # a linear model's operating point
-    Parameter("output_offset", 0.0, "output at the operating point that the model is about", "", FINITE, fixed=True),
+    Parameter(
+        "output_offset",
+        0.0,
+        "output at the operating point of the model",
+        "the output's unit",
+        FINITE,
+        fixed=True,
+    ),
     Parameter("effort_offset", 0.0, "effort that holds it there", "the effort's unit", FINITE, fixed=True),
 )
 MODELS: Final[dict[str, dict[str, Parameter]]] = {

@@ -1,5 +1,7 @@
 """`python -m tdof_npid_ros.graph NODE [arguments]` runs a node; `ros2 run` calls the functions below.
 
+`NODE --help` prints its parameters, and needs no ROS.
+
 The node is imported in here, so that Ctrl-C ends it at once and quietly, also while it is still being loaded.
 """
 
@@ -10,6 +12,8 @@ import os
 import signal
 import sys
 from types import FrameType
+
+from tdof_npid_ros.reference import node_help
 
 MODULES = {
     "plant": "plant.node",
@@ -23,6 +27,9 @@ MODULES = {
 
 def run(node: str, arguments: list[str]) -> None:
     """Run a node with its command line's arguments, the program's name first."""
+    if {"-h", "--help"} & set(arguments[1:]):
+        print(node_help(node))
+        return
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
     importlib.import_module(f"tdof_npid_ros.graph.{MODULES[node]}").main(arguments)
@@ -65,6 +72,8 @@ def replay() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in MODULES:
-        print(f"usage: python -m tdof_npid_ros.graph {{{','.join(MODULES)}}} [--ros-args ...]", file=sys.stderr)
+        print(
+            f"usage: python -m tdof_npid_ros.graph {{{','.join(MODULES)}}} [--help] [--ros-args ...]", file=sys.stderr
+        )
         sys.exit(2)
     run(sys.argv[1], sys.argv[1:])
