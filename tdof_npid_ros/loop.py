@@ -9,8 +9,8 @@ lanes side by side so that the compiler can vectorise over them. Both give the s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -26,7 +26,7 @@ from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.states import loaded, store
-from tdof_npid_ros.scenario import SampledPlan
+from tdof_npid_ros.scenario import SampledPlan, Segment
 
 VECTOR = 8  # lanes: block widths are multiples of it, and at least two of it
 LARGEST_BLOCK = 64  # lanes
@@ -35,7 +35,7 @@ LARGEST_OUTPUT = (
 )
 
 # A lane's rows: its coefficients, then these, then the plant's state.
-(_U_I, _Z, _ERROR_SUM, _FINITE, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 10)
+(_U_I, _Z, _ERROR_SUM, _FINITE, _LARGEST, _Y, _U, _V, _V_OLD, _V_DUE, _X) = range(COEFFICIENTS, COEFFICIENTS + 11)
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,29 @@ class Integrals:
     Attributes:
         iae: integral of the absolute error (9), trapezoidal rule, (lanes,).
         finite_fraction: fraction of the outputs below LARGEST_OUTPUT, (lanes,); 1 for a lane that did not diverge.
+        early_rest_iae, late_rest_iae: the parts of the IAE from the halves of `SampledPlan.rest`, (lanes,).
+        rest_error: the largest absolute error in the late half, (lanes,); all three 0 for a plan without rest.
     """
 
     iae: np.ndarray
     finite_fraction: np.ndarray
+    early_rest_iae: np.ndarray
+    late_rest_iae: np.ndarray
+    rest_error: np.ndarray
+
+    def __getitem__(self, lanes: Any) -> Integrals:
+        """Those of some lanes."""
+        return Integrals(*(getattr(self, field.name)[lanes] for field in fields(self)))
+
+    def put(self, lanes: Any, measured: Integrals) -> None:
+        """Take those of some lanes."""
+        for field in fields(self):
+            getattr(self, field.name)[lanes] = getattr(measured, field.name)
+
+
+def joined(parts: Sequence[Integrals]) -> Integrals:
+    """Those of several runs, lane after lane."""
+    return Integrals(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Integrals)))
 
 
 def simulate(plant_at: PlantAt, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Trajectory:
@@ -129,16 +148,23 @@ def _run(
 ) -> Integrals:
     steps = signals.steps
     c = coefficients(gains, signals.sample_period_ns / 1e9)
-    iae, finite = np.empty((2, gains.lanes))
+    iae, finite, early, late, largest = np.zeros((5, gains.lanes))
     for block in _blocks(gains):
         gain_limits = limits_of(gains, block.start)
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
-        lane_rows = _run_block_of(plant_at, gains, _padded(c[:, block], width), gain_limits, signals, limits, y, u)
+        lane_rows, sums = _run_block_of(
+            plant_at, gains, _padded(c[:, block], width), gain_limits, signals, limits, y, u
+        )
         iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
+        if signals.rest is not None:
+            before, half, whole = (sums[k][: block.stop - block.start] for k in (*signals.rest, steps + 1))
+            early[block], late[block] = half - before, whole - half
+            largest[block] = lane_rows[_LARGEST, : block.stop - block.start]
         if len(output):
             output[:, block], effort[:, block] = y[:, : block.stop - block.start], u[:, : block.stop - block.start]
-    return Integrals(iae * (signals.sample_period_ns / 1e9), finite / (steps + 1))
+    h = signals.sample_period_ns / 1e9
+    return Integrals(iae * h, finite / (steps + 1), early * h, late * h, largest)
 
 
 def _blocks(gains: Gains) -> Iterator[slice]:
@@ -167,8 +193,13 @@ def _run_block_of(
     limits: tuple[float, float],
     y: np.ndarray,
     u: np.ndarray,
-) -> np.ndarray:
-    """Run `width` lanes through every segment of the plan; returns the lanes' rows, (_X + states, width)."""
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Run `width` lanes through every segment of the plan.
+
+    Returns:
+        The lanes' rows, (_X + states, width), and their sum of errors before the samples where their rest begins, where
+        its late half does, and at the end.
+    """
     width = c.shape[1]
     plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, limits)
     initial = plant.initial_state
@@ -179,7 +210,8 @@ def _run_block_of(
     if (rest := rest_setpoint(signals.start, y_0, u_0)) is not None:
         rows[_U_I : _Z + 1] = settled(c, gains, rest, y_0, u_0)
     ring: np.ndarray | None = None
-    for segment in signals.segments:
+    sums = {}
+    for segment in _with_rest_apart(signals):
         sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
             ring = _aligned_zeros(sampled.delay + 2, width)
@@ -192,7 +224,19 @@ def _run_block_of(
             kernel_for(sampled, _run_lane)(*arguments)
         else:
             kernel_for(sampled, _run_block)(*arguments, (0,) * width)
-    return rows
+        sums[last] = rows[_ERROR_SUM].copy()
+        if signals.rest is not None and last == signals.rest.middle:
+            rows[_LARGEST] = 0.0
+    return rows, sums
+
+
+def _with_rest_apart(signals: SampledPlan) -> Iterator[Segment]:
+    """The plan's segments, the last of them cut where its rest begins and where the late half of that does."""
+    *before, final = signals.segments
+    yield from before
+    cuts = [k for k in signals.rest or () if k > final.first]
+    for first, last in pairwise([final.first, *cuts, final.last]):
+        yield Segment(first, last, final.plant)
 
 
 def _aligned_zeros(rows: int, width: int) -> np.ndarray:
@@ -232,7 +276,7 @@ def _run_lane(
     new = np.uint64(first) % size
     c = lane_coefficients(rows, 0, 1)
     x = loaded(x, rows, _X, 1)
-    u_i, z, error_sum, sound_outputs = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE]
+    u_i, z, error_sum, finite_outputs, largest = rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE], rows[_LARGEST]
     for k in range(np.uint64(first), np.uint64(last)):
         r, d = setpoint[k], disturbance[k]
         oldest = _next_slot(new, size)
@@ -240,15 +284,18 @@ def _run_lane(
         y, u, v, u_i, z = answered(plant, x, u_i, z, c, gain_limits, limits, r, d)
         ring[new] = v
         x = advance_bounded(plant, x, ring[oldest], v if plant.delay == 0 else ring[due], d)
-        error_sum += weight[k] * abs(r - y)
+        error = abs(r - y)
+        error_sum += weight[k] * error
+        if error > largest:
+            largest = error
         if abs(y) < LARGEST_OUTPUT:
-            sound_outputs += 1.0
+            finite_outputs += 1.0
         if y_out.shape[0]:
             y_out[k] = y
             u_out[k] = u
         new = oldest
     store(x, rows, _X, 1)
-    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE] = u_i, z, error_sum, sound_outputs
+    rows[_U_I], rows[_Z], rows[_ERROR_SUM], rows[_FINITE], rows[_LARGEST] = u_i, z, error_sum, finite_outputs, largest
 
 
 @entry_point
@@ -293,7 +340,9 @@ def _run_block(
             x = advance_bounded(plant, x, rows[_V_OLD * w + j], v_due, d)
             rows[_V * w + j] = v
             store(x, rows, _X * w + j, w)
-            rows[_ERROR_SUM * w + j] += weight[k] * abs(r - y)
+            error = abs(r - y)
+            rows[_ERROR_SUM * w + j] += weight[k] * error
+            rows[_LARGEST * w + j] = error if error > rows[_LARGEST * w + j] else rows[_LARGEST * w + j]
             rows[_FINITE * w + j] += 1.0 if abs(y) < LARGEST_OUTPUT else 0.0
             rows[_Y * w + j] = y
             rows[_U * w + j] = u

@@ -35,6 +35,7 @@ from tdof_npid_ros.one_line import one_line
 SIGNALS = ("setpoint", "disturbance")
 PLANT = "plant."  # before the names of the plant's parameters
 START = "start"  # the column of a plan that begins at rest; its value is the same at each point
+LONGEST_REST, SHORTEST_REST = 0.2, 0.05  # fractions of an episode: the stretch from which is judged whether it rests
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
 LONGEST_TIME = 1e9  # s, thirty years: of a plan and of whatever lasts in it
 MOST_VALUES = 300_000  # points times signals, as many as ramps over five minutes at 1 ms make: a plan is one message
@@ -46,6 +47,14 @@ GRAMMAR = (
 
 class PlanError(ValueError):
     """A plan that cannot be run; the message quotes the line that is wrong."""
+
+
+class Rest(NamedTuple):
+    """The end of an episode, where nothing changes any more: samples `first` to the last, and the half of them from
+    `middle` on."""
+
+    first: int
+    middle: int
 
 
 class Segment(NamedTuple):
@@ -83,6 +92,19 @@ class SampledPlan:
         weight = np.ones(self.steps + 1)
         weight[[0, -1]] = 0.5
         return weight
+
+    @cached_property
+    def rest(self) -> Rest | None:
+        """The stretch at the end from which is judged whether a loop comes to rest: at most the last fifth.
+
+        None where signals or plant change up to the end, so that no loop can.
+        """
+        moves = (signal[1:] != signal[:-1] for signal in (self.setpoint, self.disturbance))
+        changes = [int(changed[-1]) + 1 for move in moves if (changed := np.flatnonzero(move)).size]
+        first = max([*changes, self.segments[-1].first, math.ceil((1.0 - LONGEST_REST) * self.steps)])
+        if self.steps - first < max(SHORTEST_REST * self.steps, 1):
+            return None
+        return Rest(first, first + (self.steps - first + 1) // 2)
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,29 @@ It knows no ROS; times are the outputs' stamps in s.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from tdof_npid_ros.case import Bounds
 from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.judge import DIVERGED
 
 Outcome = Literal["", "measured", "unsettled", "unsafe"]
+
+NOISE = 3.0
+"""Standard errors: a mean error below them is none."""
+
+FAILED = 1e30
+"""The objective of a trial that ended at once is twice this."""
+
+RESTLESS = 1.0
+"""The violation of an error that stays, or is not settled within the time limit."""
+
+DECAYING = 0.9
+"""Of the mean error half a settle_time before: an error that has not fallen below this does not decay."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +109,10 @@ class Trial:
         before: the level where it begins.
         setpoint: what the setpoint is to be now.
         outcome: empty while it runs; `unsettled` and `unsafe` are failures.
-        iae: of the step, by the trapezoidal rule, for a step of 1.
+        iae: of the step, by the trapezoidal rule, for a step of 1; with what would still come, told from how the error
+            decays while it settles.
         fraction: how far a failed trial came, below 1; 1 for one that did not fail.
+        rests: whether the error has come to rest, or decays; False also for one that has not settled in time.
     """
 
     def __init__(self, test: StepTest, before: float, after: float) -> None:
@@ -102,11 +120,24 @@ class Trial:
         self._after = after
         self.before = before
         self._settling = Settling(test, before)
-        self._latest: tuple[float, float] | None = None
         self.setpoint = before
         self.outcome: Outcome = ""
+        self._errors: deque[tuple[float, float]] = deque()  # times and errors of the last settle_time
         self.iae = 0.0
         self.fraction = 0.0
+        self.rests = False
+
+    @property
+    def value(self) -> float:
+        """The candidate's objective: the IAE, or for a failed trial one above all of these, the earlier the larger."""
+        return self.iae if self.outcome == "measured" else FAILED * (2.0 - self.fraction)
+
+    @property
+    def violation(self) -> float:
+        """How far the candidate is from one that may win: 0 for one that settles and comes to rest."""
+        if self.outcome == "measured":
+            return 0.0 if self.rests else RESTLESS
+        return DIVERGED + 1.0 - self.fraction
 
     def take(self, time: float, output: float, effort: float | None) -> None:
         """Take an output and the effort on the plant, at a time in s."""
@@ -119,16 +150,32 @@ class Trial:
             return
         self._settling.take(time, output)
         if stepped:
-            self._integrate(time, abs(self._after - output))
+            self._integrate(time, self._after - output)
         if self._settling.settled and not stepped:
             self.setpoint, self._settling = self._after, Settling(self._test, self._after)
         elif self._settling.settled or (self._settling.too_late and stepped):
             self.outcome, self.fraction = "measured", 1.0  # a slow one pays by its IAE over the whole time limit
+            if self._settling.settled:
+                self._judge_rest()
         elif self._settling.too_late:
             self.outcome = "unsettled"
 
     def _integrate(self, time: float, error: float) -> None:
-        if self._latest is not None:
-            before, its_error = self._latest
-            self.iae += 0.5 * (time - before) * (error + its_error) / self._test.step
-        self._latest = time, error
+        if self._errors:
+            before, its_error = self._errors[-1]
+            self.iae += 0.5 * (time - before) * (abs(error) + abs(its_error)) / self._test.step
+        self._errors.append((time, error))
+        while self._errors[0][0] < time - self._test.settle_time:
+            self._errors.popleft()
+
+    def _judge_rest(self) -> None:
+        """Compare the error's means over the halves of the last settle_time, beyond what noise can do."""
+        times, errors = np.array(self._errors).T
+        late = times >= times[-1] - 0.5 * self._test.settle_time
+        before, after = abs(float(errors[~late].mean())) if not late.all() else 0.0, abs(float(errors[late].mean()))
+        noise = float(errors[late].std()) / math.sqrt(np.count_nonzero(late))
+        if after <= NOISE * noise:
+            self.rests = True
+        elif after < DECAYING * before:
+            self.rests = True
+            self.iae += 0.5 * self._test.settle_time * after * after / (before - after) / self._test.step

@@ -11,7 +11,7 @@ from typing import Any
 from tdof_npid_ros.tuning import TuningError
 
 FORMAT = "tdof_npid_ros tuning checkpoint"
-VERSION = 1
+VERSION = 2
 
 
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -56,6 +56,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     version = document.get("version")
     if isinstance(version, int) and version > VERSION:
         raise TuningError(f"checkpoint {path} has version {version}, this program knows {VERSION}: update the program")
+    if isinstance(version, int) and version < VERSION:
+        raise TuningError(f"checkpoint {path} has version {version}: an older program searched otherwise, start anew")
     content = document.get("content")
     if not isinstance(content, dict) or document.get("digest") != _digest(json.dumps(content)):
         raise TuningError(f"checkpoint {path} is damaged: its digest does not match, start anew with another file")

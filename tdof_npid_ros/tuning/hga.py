@@ -14,12 +14,21 @@ and asks for the model's minimum and for samples about it, shaped like the cloud
 stalled, it restarts from a new random population, dense at the bounds, and polishes more patiently, until the budget
 is spent. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
 
+What is not allowed never wins, but it is not thrown away: the best gains lie where a constraint just holds, and the
+model must see both sides of that. So points are kept and fitted by their *merit*, f + penalty · violation · |f|. Where
+a round ends at a point that is not allowed, the next one has a larger penalty.
+
+A run has *converged* when two further rounds have ended no better than the best one.
+
 A run is the same on every machine: NumPy's PCG64 drawn only for uniform numbers, elementwise arithmetic, decimal
 powers, no BLAS and no math library.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from decimal import Decimal
 from typing import Any
 
@@ -27,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
+from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores, SearchState
 from tdof_npid_ros.tuning.quadratic import coefficients, model_step
 
 MIN_EXPLORATION = 2
@@ -43,14 +52,55 @@ SAMPLE_SPREAD = 0.6
 """Standard deviation of the samples, in those of the kept points; well below 1, so that the cloud shrinks."""
 
 PENALTY_CAP = 3.0
-"""Values above best + 3 (median - best) of the kept points count as that much: a penalty must not bend the model."""
+"""Merits above best + 3 (median - best) of the kept points count as that much: a penalty must not bend the model."""
 
 PROGRESS, PATIENCE = 1e-4, 3.0
 """A polish has stalled when PATIENCE times the kept points were told without improving by PROGRESS, relatively."""
 
+PENALTY, STIFFER = 3.0, 4.0
+"""Of the merit: at first, and by which factor it grows."""
+
+CONFIRMING_ROUNDS = 2
+"""Rounds that must end no better than the best one before the run counts as converged..."""
+
+CONFIRMED = 1e-3
+"""... by more than this, relatively."""
+
+
+@dataclass
+class HGAState(SearchState):
+    """What of a run of the HGA changes, beside its random numbers.
+
+    Attributes:
+        round: restarts so far.
+        age: generations told in this round.
+        points, merits, violations: [m, d] in 0 .. 1, [m], [m]: the best points of this round, best merit first.
+        goal: the merit below which this round counts as having made progress; `waited`: evaluations since.
+        penalty: of the merit in this round.
+        confirmations: rounds that have ended since the last that made the best better.
+        round_best: the best value when the round began.
+    """
+
+    round: int = -1
+    age: int = 0
+    points: Array = field(default_factory=lambda: np.empty((0, 0)))
+    merits: Array = field(default_factory=lambda: np.empty(0))
+    violations: Array = field(default_factory=lambda: np.empty(0))
+    goal: float = math.inf
+    waited: int = 0
+    penalty: float = PENALTY
+    confirmations: int = 0
+    round_best: float = math.inf
+
+
+_COUNTS = ("evaluations", "generation", "round", "age", "waited", "confirmations")
+_NUMBERS = ("best_value", "best_violation", "goal", "penalty", "round_best")
+
 
 class HGA(Optimizer):
     """The hybrid genetic algorithm; the module's text says what it does."""
+
+    _state: HGAState
 
     def __init__(
         self,
@@ -64,11 +114,13 @@ class HGA(Optimizer):
         mutation_rate: float = 0.04,
         shape: float = 6.0,
         polish: int = 6,
+        logarithmic: Sequence[bool] = (),
+        starts: ArrayLike = (),
     ) -> None:
         """
         Args:
             lower, upper: [d], bounds of the parameters.
-            seed: not negative; the run depends on nothing else but these arguments and the values told.
+            seed: not negative; the run depends on nothing else but these arguments and the scores told.
             population: individuals, at least 2.
             generations: the run ends after population * generations evaluations.
             eta: reproduction parameter, between 0 and 2.
@@ -76,6 +128,7 @@ class HGA(Optimizer):
             shape: how fast the mutation's reach shrinks, positive.
             polish: candidates in each step of the polish; few need the fewest evaluations, `population` the fewest
                 generations (for a live loop with that many lanes). 0: no polish and no restarts.
+            logarithmic, starts: see `Optimizer`; the starts are in the first population.
 
         Raises:
             TuningError: an argument out of its range.
@@ -85,31 +138,43 @@ class HGA(Optimizer):
             raise TuningError(
                 f"eta {eta}, mutation_rate {mutation_rate}, shape {shape}: must be in (0, 2), in [0, 1], positive"
             )
-        super().__init__(lower, upper, population * generations)
+        super().__init__(lower, upper, population * generations, logarithmic, starts)
         self.seed, self.population, self.generations, self.polish = seed, population, generations, polish
         self.eta, self.mutation_rate, self.shape = eta, mutation_rate, shape
         self._random = np.random.Generator(np.random.PCG64(seed))
-        self._round = -1
-        self._unit = self._new_round()
+        self._state = HGAState(np.empty((0, self.dimension)))
+        self._state.candidates = self._with_starts(self._new_round())
+
+    @property
+    def converged(self) -> bool:
+        """Whether an allowed point has been found and `CONFIRMING_ROUNDS` further rounds have found none better."""
+        return self.best_violation == 0.0 and self._state.confirmations >= CONFIRMING_ROUNDS
 
     def _new_round(self) -> Array:
         """Forget all but the global best and draw a random population, after the first round densely at the bounds.
 
         A valley that lies along a bound is often narrow, and a uniform population misses it.
         """
-        self._round += 1
-        self._age = 0
-        self._points = np.empty((0, self.dimension))
-        self._values = np.empty(0)
-        self._goal = float("inf")
-        self._waited = 0
+        state = self._state
+        if state.round >= 0:
+            first = state.round_best == math.inf
+            better = first or state.best_value < state.round_best - CONFIRMED * abs(state.round_best)
+            state.confirmations = 0 if better else state.confirmations + 1
+            if state.violations[0] > 0.0:
+                state.penalty *= STIFFER
+        state.round_best = state.best_value if state.best_violation == 0.0 else math.inf
+        state.round += 1
+        state.age = state.waited = 0
+        state.points = np.empty((0, self.dimension))
+        state.merits, state.violations = np.empty(0), np.empty(0)
+        state.goal = math.inf
         uniform = self._random.random((self.population, self.dimension))
-        return uniform if self._round == 0 else uniform * uniform * (3.0 - 2.0 * uniform)
+        return uniform if state.round == 0 else uniform * uniform * (3.0 - 2.0 * uniform)
 
     @property
     def _kept(self) -> int:
         """How many of the best points of this round the polish keeps."""
-        fraction = KEPT_PER_COEFFICIENT[min(self._round, len(KEPT_PER_COEFFICIENT) - 1)]
+        fraction = KEPT_PER_COEFFICIENT[min(self._state.round, len(KEPT_PER_COEFFICIENT) - 1)]
         return int(fraction * coefficients(self.dimension))
 
     @property
@@ -119,83 +184,72 @@ class HGA(Optimizer):
             return self.generations
         return max(MIN_EXPLORATION, -(-self._kept // self.population))
 
-    def _next(self, told: Array) -> Array:
-        self._age += 1
+    def _next(self, told: Scores) -> Array:
+        self._state.age += 1
+        merits = told.objective + self._state.penalty * told.violation * np.abs(told.objective)
         if self.polish:
-            self._keep_best(told)
-        if self._age < self._exploration:
-            return self._mutated(self._reproduced(told))
-        if self._stalled(told.size):
+            self._keep_best(merits, told.violation)
+        if self._state.age < self._exploration:
+            return self._mutated(self._reproduced(merits, told.violation))
+        if self._stalled(merits.size):
             return self._new_round()
         return self._polished()
 
-    def _reproduced(self, told: Array) -> Array:
-        best, worst = told.min(), told.max()
-        weight = (told - best) / (worst - best) if worst > best else np.zeros_like(told)
-        step = self.eta * self._random.random(told.size) * weight
-        x = self._unit
-        moved: Array = np.clip(x + step[:, None] * (x[np.argmin(told)] - x), 0.0, 1.0)
+    def _reproduced(self, merits: Array, violation: Array) -> Array:
+        allowed = merits[violation == 0.0]
+        values = np.minimum(merits, max(allowed.max(), merits.min())) if allowed.size else merits
+        best, worst = values.min(), values.max()
+        weight = (values - best) / (worst - best) if worst > best else np.zeros_like(values)
+        step = self.eta * self._random.random(values.size) * weight
+        x = self._state.candidates
+        moved: Array = np.clip(x + step[:, None] * (x[np.argmin(values)] - x), 0.0, 1.0)
         return moved
 
     def _mutated(self, x: Array) -> Array:
         mutates = self._random.random(x.shape) < self.mutation_rate
         bound = np.where(self._random.random(x.shape) < 0.5, 0.0, 1.0)
         fraction = self._random.random(x.shape)
-        power = Decimal(1.0 - self._age / self._exploration) ** Decimal(self.shape)
+        power = Decimal(1.0 - self._state.age / self._exploration) ** Decimal(self.shape)
         for i, j in np.argwhere(mutates):
             reach = 1.0 - float(Decimal(float(fraction[i, j])) ** power)
             x[i, j] += reach * (bound[i, j] - x[i, j])
         return x
 
-    def _keep_best(self, told: Array) -> None:
-        values = np.append(self._values, told)
-        best = np.argsort(values, kind="stable")[: self._kept]
-        self._points, self._values = np.concatenate([self._points, self._unit])[best], values[best]
+    def _keep_best(self, merits: Array, violation: Array) -> None:
+        state = self._state
+        merits, violation = np.append(state.merits, merits), np.append(state.violations, violation)
+        best = np.argsort(merits, kind="stable")[: self._kept]
+        state.points = np.concatenate([state.points, state.candidates])[best]
+        state.merits, state.violations = merits[best], violation[best]
 
     def _stalled(self, told: int) -> bool:
-        best = float(self._values[0])
-        if best < self._goal:
-            self._goal, self._waited = best - PROGRESS * abs(best), 0
+        state, best = self._state, float(self._state.merits[0])
+        if best < state.goal:
+            state.goal, state.waited = best - PROGRESS * abs(best), 0
         else:
-            self._waited += told
-        return self._waited > PATIENCE * self._kept
+            state.waited += told
+        return state.waited > PATIENCE * self._kept
 
     def _polished(self) -> Array:
-        best, median = self._values[0], self._values[self._values.size // 2]
-        values = np.minimum(self._values, best + PENALTY_CAP * (median - best))
-        centre, cloud = model_step(self._points, values, TRUST_RADIUS)
+        points, merits = self._state.points, self._state.merits
+        best, median = merits[0], merits[merits.size // 2]
+        centre, cloud = model_step(points, np.minimum(merits, best + PENALTY_CAP * (median - best)), TRUST_RADIUS)
         # Uniform with variance 1: a normal draw's rare tails would go through the C library.
         deviation = (2.0 * self._random.random((self.polish, self.dimension)) - 1.0) * np.sqrt(3.0)
         deviation[0] = 0.0
-        about = np.where(np.arange(self.polish)[:, None] % 2 == 0, centre, self._points[0])
+        about = np.where(np.arange(self.polish)[:, None] % 2 == 0, centre, points[0])
         spread = (cloud[None, :, :] * deviation[:, None, :]).sum(axis=2)
         samples: Array = np.clip(about + SAMPLE_SPREAD * spread, 0.0, 1.0)
         return samples
 
     def state(self) -> dict[str, Any]:
         """All that the run is, as JSON can hold it exactly; `from_state` goes on from it bit for bit."""
+        changing = {one.name: _encoded(getattr(self._state, one.name)) for one in fields(HGAState)}
         return {
             "algorithm": "hga",
-            "lower": self.lower.tolist(),
-            "upper": self.upper.tolist(),
-            "seed": self.seed,
-            "population": self.population,
-            "generations": self.generations,
-            "eta": self.eta,
-            "mutation_rate": self.mutation_rate,
-            "shape": self.shape,
-            "polish": self.polish,
-            "evaluations": self.evaluations,
-            "generation": self.generation,
-            "best_value": None if self._best_unit is None else self.best_value,
-            "best": None if self._best_unit is None else self._best_unit.tolist(),
-            "candidates": self._unit.tolist(),
-            "round": self._round,
-            "age": self._age,
-            "points": self._points.tolist(),
-            "values": self._values.tolist(),
-            "goal": None if self._goal == float("inf") else self._goal,
-            "waited": self._waited,
+            **self._bounds_state(),
+            **{name: getattr(self, name) for name in _ARGUMENTS},
+            **changing,
             "random": self._random.bit_generator.state,
         }
 
@@ -207,32 +261,47 @@ class HGA(Optimizer):
             TuningError: the state is not one of an HGA, or damaged.
         """
         try:
-            return cls._from_state(state)
+            hga = cls(**{name: state[name] for name in ("lower", "upper", "logarithmic", "starts", *_ARGUMENTS)})
+            hga._state = _decoded(state, hga.dimension)
+            left = hga.budget - hga.evaluations
+            if (left > 0) != (len(hga._state.candidates) > 0) or len(hga._state.candidates) > max(left, 0):
+                raise ValueError("candidates")
+            hga._random.bit_generator.state = state["random"]
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise TuningError(f"state of the HGA is damaged, start anew: {error!r}") from None
-
-    @classmethod
-    def _from_state(cls, state: dict[str, Any]) -> HGA:
-        arguments = ("seed", "population", "generations", "eta", "mutation_rate", "shape", "polish")
-        hga = cls(state["lower"], state["upper"], **{name: state[name] for name in arguments})
-        counts = ("evaluations", "generation", "round", "age", "waited")
-        _check(**{name: state[name] for name in counts})
-        hga.evaluations, hga.generation, hga._round, hga._age, hga._waited = (state[name] for name in counts)
-        if state["best"] is not None:
-            hga._best_unit = _unit([state["best"]], hga.dimension)[0]
-            hga.best_value = float(_finite([state["best_value"]])[0])
-        elif hga.generation > 0:
-            raise ValueError("no best")
-        if state["goal"] is not None:
-            hga._goal = float(_finite([state["goal"]])[0])
-        hga._unit = _unit(state["candidates"], hga.dimension)
-        hga._points, hga._values = _unit(state["points"], hga.dimension), _finite(state["values"])
-        if len(hga._points) != len(hga._values) or (hga._values[1:] < hga._values[:-1]).any():
-            raise ValueError("points and values")
-        if (hga.evaluations < hga.budget) != (len(hga._unit) > 0) or hga.evaluations + len(hga._unit) > hga.budget:
-            raise ValueError("candidates")
-        hga._random.bit_generator.state = state["random"]
         return hga
+
+
+_ARGUMENTS = ("seed", "population", "generations", "eta", "mutation_rate", "shape", "polish")
+
+
+def _encoded(value: Any) -> Any:
+    """A part of the state as JSON holds it: infinity, which JSON does not know, is None."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return None if value == math.inf else value
+
+
+def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
+    """The part of a state that changes; raises ValueError or TypeError where it cannot be."""
+    _check(**{name: state[name] for name in _COUNTS})
+    numbers = {name: math.inf if state[name] is None else float(_finite([state[name]])[0]) for name in _NUMBERS}
+    best = None if state["best"] is None else _unit([state["best"]], dimension)[0]
+    points, merits = _unit(state["points"], dimension), _finite(state["merits"])
+    violations = _finite(state["violations"])
+    if not len(points) == len(merits) == len(violations) or (merits[1:] < merits[:-1]).any():
+        raise ValueError("points, merits and violations")
+    if (best is None) != (state["generation"] == 0) or (best is None) != (numbers["best_value"] == math.inf):
+        raise ValueError("best")
+    return HGAState(
+        candidates=_unit(state["candidates"], dimension),
+        best=best,
+        points=points,
+        merits=merits,
+        violations=violations,
+        **{name: state[name] for name in _COUNTS},
+        **numbers,  # type: ignore[arg-type]
+    )
 
 
 def _check(**counts: int) -> None:

@@ -42,10 +42,16 @@ L = TypeVar("L", bound=LiveLoop)
 
 def integrals_of(signals: SampledPlan, output: Array) -> Integrals:
     """The integrals of an episode from its outputs (steps + 1, lanes): the same bits as `loop.integrals`."""
-    error = signals.weight[:, None] * np.abs(signals.setpoint[:, None] - output)
-    iae = np.cumsum(error, axis=0)[-1] * (signals.sample_period_ns / 1e9)  # a sum in the order of time
+    error = np.abs(signals.setpoint[:, None] - output)
+    sums = np.cumsum(signals.weight[:, None] * error, axis=0)  # in the order of time
     finite = np.count_nonzero(np.abs(output) < LARGEST_OUTPUT, axis=0)
-    return Integrals(iae, finite / (signals.steps + 1))
+    early, late, largest = np.zeros((3, output.shape[1]))
+    if signals.rest is not None:
+        first, middle = signals.rest
+        early, late = sums[middle - 1] - sums[first - 1], sums[-1] - sums[middle - 1]
+        largest = np.fmax.reduce(error[middle:], axis=0, initial=0.0)
+    h = signals.sample_period_ns / 1e9
+    return Integrals(sums[-1] * h, finite / (signals.steps + 1), early * h, late * h, largest)
 
 
 class EpisodeOutputs:
@@ -143,13 +149,13 @@ def measure(
         usable_loops: the loops to use now, at least one; called again when one was lost.
         lost: told which loop was lost, and why.
     """
-    results = {episode: Integrals(*np.empty((2, len(candidates)))) for episode in EPISODES}
+    results = {episode: Integrals(*np.empty((5, len(candidates)))) for episode in EPISODES}
     done = {episode: np.zeros(len(candidates), dtype=bool) for episode in EPISODES}
 
     def work(loop: L, portion: list[tuple[str, Indices]]) -> None:
         for episode, part in portion:
             measured = loop.run_episode(episode, candidates[part])
-            results[episode].iae[part], results[episode].finite_fraction[part] = measured.iae, measured.finite_fraction
+            results[episode].put(part, measured)
             done[episode][part] = True
 
     while not all(finished.all() for finished in done.values()):

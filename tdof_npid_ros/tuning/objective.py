@@ -1,7 +1,7 @@
 """The objective (10) of candidate gains: IAE = IAE_SP + w·IAE_DIS, whole populations at a time, on all cores.
 
-`objective_values` is the formula alone: the live tuner gives it the integrals that it measured over ROS 2 and gets the
-same bits (E3).
+`scores` takes integrals from anywhere: the live tuner gives it those that it measured over ROS 2 and gets the same bits
+(tuned live = tuned offline).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from tdof_npid_ros.control.gains import gains_from_candidates
-from tdof_npid_ros.loop import VECTOR, Integrals
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.loop import VECTOR, Integrals, joined
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
 
-LARGEST_IAE = 1e6
+LARGEST_IAE = 1e30
 """unit·s: an IAE above it is compressed; such a loop is useless, and only its place in the order matters."""
 
 _DOUBLINGS = 1024.0  # of LARGEST_IAE within the range of a float: a compressed IAE stays below 2·LARGEST_IAE
@@ -35,6 +35,12 @@ def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float)
     return _cost(setpoint) + weight * _cost(disturbance)
 
 
+def scores(problem: TuningProblem, candidates: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
+    """The scores of candidates (n, len(problem.names)) from the integrals of their episodes, (n,) each."""
+    gains = gains_from_candidates(problem.base, problem.names, candidates)
+    return problem.judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
+
+
 def _cost(integrals: Integrals) -> Array:
     fraction = integrals.finite_fraction
     finite = (fraction >= 1.0) & np.isfinite(integrals.iae)
@@ -50,9 +56,9 @@ def _compressed(iae: Array) -> Array:
 
 
 class Objective:
-    """The objective of a problem's candidates, computed in process.
+    """Scores a problem's candidates, in process.
 
-    Its values do not depend on the number of threads: lanes are independent, and each is summed in the order of time.
+    They do not depend on the number of threads: lanes are independent, and each is summed in the order of time.
     """
 
     def __init__(self, problem: TuningProblem, threads: int | None = None) -> None:
@@ -64,14 +70,13 @@ class Objective:
         self._threads = threads or available_cores()
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="objective")
 
-    def __call__(self, candidates: Array) -> Array:
-        """Values (n,) of candidates (n, len(problem.names)).
+    def __call__(self, candidates: Array) -> Scores:
+        """Scores of candidates (n, len(problem.names)).
 
         Raises:
             GainsError: a candidate is not a valid set of gains.
         """
-        setpoint, disturbance = self.integrals(candidates)
-        return objective_values(setpoint, disturbance, self._problem.weight)
+        return scores(self._problem, candidates, *self.integrals(candidates))
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
         """Of the setpoint and the disturbance episode, (n,) each."""
@@ -81,7 +86,7 @@ class Objective:
             for block in _blocks(len(candidates), self._threads)
         ]
         running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
-        setpoint, disturbance = (_joined([block.result() for block in episode]) for episode in running)
+        setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance
 
 
@@ -95,7 +100,3 @@ def _blocks(lanes: int, threads: int) -> list[slice]:
     count = -(-threads // len(EPISODES))
     size = max(2 * VECTOR, -(-lanes // (count * VECTOR)) * VECTOR)
     return [slice(first, min(first + size, lanes)) for first in range(0, lanes, size)]
-
-
-def _joined(blocks: list[Integrals]) -> Integrals:
-    return Integrals(np.concatenate([b.iae for b in blocks]), np.concatenate([b.finite_fraction for b in blocks]))

@@ -2,7 +2,7 @@
 
 `Cmaes` is the `cma` library's CMA-ES with restarts of doubled population (IPOP), `DifferentialEvolution` is SciPy's.
 Neither library can write its state but by pickle, which must not be read from a file that others could have made. So
-their state is the values told: a restored run asks and is told them again. That is exact on one machine; across
+their state is the scores told: a restored run asks and is told them again. That is exact on one machine; across
 machines it is not, for both use the machine's BLAS or math library. The HGA's state is exact everywhere.
 """
 
@@ -13,13 +13,15 @@ import queue
 import threading
 import warnings
 import weakref
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
+from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores, SearchState
 from tdof_npid_ros.tuning.hga import HGA
 
 INITIAL_STEP = 0.3
@@ -35,6 +37,8 @@ def make_optimizer(
     population: int = 40,
     generations: int = 200,
     polish: int = 6,
+    logarithmic: Sequence[bool] = (),
+    starts: ArrayLike = (),
 ) -> Optimizer:
     """An optimiser that ends after population * generations evaluations.
 
@@ -43,13 +47,23 @@ def make_optimizer(
         lower, upper: [d], bounds of the parameters.
         seed: not negative.
         polish: of the HGA; the others have none.
+        logarithmic, starts: see `Optimizer`.
 
     Raises:
         TuningError: unknown algorithm, or an argument out of its range.
     """
     kind = _kind(algorithm)
     options = {"polish": polish} if kind is HGA else {}
-    return kind(lower, upper, seed=seed, population=population, generations=generations, **options)
+    return kind(
+        lower,
+        upper,
+        seed=seed,
+        population=population,
+        generations=generations,
+        logarithmic=logarithmic,
+        starts=starts,
+        **options,
+    )
 
 
 def restore_optimizer(state: dict[str, Any]) -> Optimizer:
@@ -64,42 +78,62 @@ def restore_optimizer(state: dict[str, Any]) -> Optimizer:
 
 
 class _Replayed(Optimizer):
-    """A library's optimiser, whose state is the values that it was told."""
+    """A library's optimiser, whose state is the scores that it was told.
+
+    It knows no violations, so it is told `Scores.values`.
+    """
 
     algorithm: str
 
-    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int,
+        population: int,
+        generations: int,
+        logarithmic: Sequence[bool] = (),
+        starts: ArrayLike = (),
+    ) -> None:
         least = {"seed": (seed, 0), "population": (population, 5), "generations": (generations, 1)}
         for name, (count, minimum) in least.items():
             if isinstance(count, bool) or not isinstance(count, int) or count < minimum:
                 raise TuningError(f"{name} {count!r}: must be a whole number, at least {minimum}")
-        super().__init__(lower, upper, population * generations)
+        super().__init__(lower, upper, population * generations, logarithmic, starts)
         self.seed, self.population, self.generations = seed, population, generations
-        self._told: list[list[float]] = []
+        self._told: list[tuple[list[float], list[float]]] = []
+        self._random = np.random.default_rng(seed)
+        self._state = SearchState(self._first())
 
-    def tell(self, values: ArrayLike) -> None:
-        super().tell(values)
-        self._told.append(np.asarray(values, dtype=np.float64).tolist())
+    def tell(self, scores: Scores | ArrayLike) -> None:
+        told = scores if isinstance(scores, Scores) else Scores.allowed(scores)
+        super().tell(told)
+        self._told.append((told.objective.tolist(), told.violation.tolist()))
+
+    @abstractmethod
+    def _first(self) -> Array:
+        """The first candidates [n, d] in 0 .. 1."""
 
     def state(self) -> dict[str, Any]:
         return {
             "algorithm": self.algorithm,
-            "lower": self.lower.tolist(),
-            "upper": self.upper.tolist(),
+            **self._bounds_state(),
             "seed": self.seed,
             "population": self.population,
             "generations": self.generations,
-            "told": [list(values) for values in self._told],
+            "evaluations": self.evaluations,
+            "told": [[list(values) for values in told] for told in self._told],
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> _Replayed:
         """The run that `state` was taken of. Raises TuningError where the state is damaged."""
         try:
-            arguments = {name: state[name] for name in ("seed", "population", "generations")}
-            optimizer = cls(state["lower"], state["upper"], **arguments)
-            for values in state["told"]:
-                optimizer.tell(values)
+            names = ("lower", "upper", "seed", "population", "generations", "logarithmic", "starts")
+            optimizer = cls(**{name: state[name] for name in names})
+            for objective, violation in state["told"]:
+                optimizer.tell(Scores(np.array(objective), np.array(violation)))
         except (KeyError, TypeError, ValueError) as error:
             raise TuningError(f"state of {cls.algorithm} is damaged, start anew: {error!r}") from None
         return optimizer
@@ -110,11 +144,9 @@ class Cmaes(_Replayed):
 
     algorithm = "cmaes"
 
-    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
-        super().__init__(lower, upper, seed=seed, population=population, generations=generations)
-        self._random = np.random.default_rng(seed)
+    def _first(self) -> Array:
         self._restarts = -1
-        self._unit = self._restarted()
+        return self._restarted()
 
     def _restarted(self) -> Array:
         try:
@@ -132,15 +164,17 @@ class Cmaes(_Replayed):
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self._strategy = cma.CMAEvolutionStrategy(self._random.random(self.dimension), INITIAL_STEP, options)
+            first = self._random.random((1, self.dimension))
+            first = self._with_starts(first) if self._restarts == 0 else first
+            self._strategy = cma.CMAEvolutionStrategy(first[0], INITIAL_STEP, options)
         return self._asked()
 
     def _asked(self) -> Array:
         self._points = self._strategy.ask()
         return np.clip(np.array(self._points, dtype=np.float64), 0.0, 1.0)
 
-    def _next(self, told: Array) -> Array:
-        self._strategy.tell(self._points, told.tolist())
+    def _next(self, told: Scores) -> Array:
+        self._strategy.tell(self._points, told.values.tolist())
         return self._restarted() if self._strategy.stop() else self._asked()
 
 
@@ -153,23 +187,21 @@ class DifferentialEvolution(_Replayed):
 
     algorithm = "de"
 
-    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int, population: int, generations: int) -> None:
-        super().__init__(lower, upper, seed=seed, population=population, generations=generations)
+    def _first(self) -> Array:
         self._asked: queue.SimpleQueue[Array | None] = queue.SimpleQueue()
         self._values: queue.SimpleQueue[Array | None] = queue.SimpleQueue()
         weakref.finalize(self, self._values.put, None)
-        random = np.random.default_rng(seed)
-        initial = random.random((population, self.dimension))
-        arguments = (initial, random, generations, self._asked, self._values)
+        initial = self._with_starts(self._random.random((self.population, self.dimension)))
+        arguments = (initial, self._random, self.generations, self._asked, self._values)
         threading.Thread(target=_evolve, args=arguments, name="differential_evolution", daemon=True).start()
-        self._unit = self._candidates()
+        return self._candidates()
 
     def _candidates(self) -> Array:
         candidates = self._asked.get()
         return np.empty((0, self.dimension)) if candidates is None else candidates
 
-    def _next(self, told: Array) -> Array:
-        self._values.put(told)
+    def _next(self, told: Scores) -> Array:
+        self._values.put(told.values)
         return self._candidates()
 
 

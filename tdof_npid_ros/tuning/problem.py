@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,13 @@ from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains, GainsError
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameters import TUNER, WEIGHT
 from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.stability import StabilityError
+from tdof_npid_ros.stability.plant import loop_plant
+from tdof_npid_ros.stability.screen import Screen
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.judge import Constraints, Judge
+from tdof_npid_ros.tuning.space import Space
 
 EPISODES = ("setpoint", "disturbance")
 """IAE_SP and IAE_DIS of the objective (10) are those of these episodes of the case."""
@@ -24,6 +29,12 @@ POPULATION, GENERATIONS = 40, 200
 
 LARGEST_BUDGET = 10**12
 """Evaluations: more than a year of them."""
+
+LOGARITHMIC = ("kp", "ki", "kd", "sigma")
+"""Gains of which it matters by which factor they change; alpha and beta are weights between 0 and 1."""
+
+AT_BOUND = 1e-3
+"""Of a bound: nearer than that, gains are at it."""
 
 POLISH = 6
 """By default: candidates in each step of the HGA's polish, for the fewest evaluations."""
@@ -42,9 +53,13 @@ class TuningProblem:
         seed: of the optimiser's random numbers.
         population, generations: their product is the budget of evaluations.
         polish: candidates in each step of the HGA's polish.
+        constraints: margins that the loop must have.
+        warm: whether the case's own gains are among the first candidates.
+        until_converged: whether the search ends when it has converged, before its budget is spent.
 
     Raises:
-        TuningError: the case lacks an episode or bounds, or its bounds allow gains that no controller takes.
+        TuningError: the case lacks an episode or bounds, its bounds allow gains that no controller takes, or margins
+            are asked for that are not known here.
     """
 
     case: Case
@@ -56,6 +71,9 @@ class TuningProblem:
     population: int = POPULATION
     generations: int = GENERATIONS
     polish: int = POLISH
+    constraints: Constraints = field(default_factory=Constraints)
+    warm: bool = False
+    until_converged: bool = False
 
     def __post_init__(self) -> None:
         try:
@@ -76,6 +94,9 @@ class TuningProblem:
         if missing:
             raise TuningError(f"{self.case.name} has no bounds.{missing[0]}: give [lower, upper] to its tuner")
         self._check_bounds()
+        if self.constraints.given and self.screen is None:
+            asked = ", ".join(self.constraints.given)
+            raise TuningError(f"{self.without_margins}: no margins are known here, tune without {asked}")
 
     def _check_bounds(self) -> None:
         bounds = dict(zip(self.names, self.bounds, strict=True))
@@ -113,6 +134,58 @@ class TuningProblem:
         unused = {name: 0.0 for name in ("alpha", "beta") if name not in TUNED[self.controller]}
         return self.case.gains.with_values(type=self.controller, **unused)
 
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which of the free gains are searched along a logarithmic scale."""
+        return tuple(name in LOGARITHMIC for name in self.names)
+
+    @property
+    def starts(self) -> Array:
+        """The candidates that the search begins with beside random ones, (k, len(names))."""
+        if not self.warm:
+            return np.empty((0, len(self.names)))
+        gains = [float(self.case.gains.per_lane(name)[0]) for name in self.names]
+        start: Array = np.clip([gains], *np.array(self.bounds).T)
+        return start
+
+    @property
+    def space(self) -> Space:
+        """What is searched: the free gains between their bounds, along their scales."""
+        lower, upper = zip(*self.bounds, strict=True)
+        return Space.of_bounds(lower, upper, self.logarithmic)
+
+    @property
+    def screen(self) -> Screen | None:
+        """Of the margins of the linear loop; None if there is none, for which `without_margins` gives the reason."""
+        return self._screening[0]
+
+    @property
+    def without_margins(self) -> str:
+        """Why no margins are known here; empty if they are."""
+        return self._screening[1]
+
+    @cached_property
+    def _screening(self) -> tuple[Screen | None, str]:
+        try:
+            return Screen(loop_plant(self.case)), ""
+        except StabilityError as error:
+            return None, str(error)
+
+    @cached_property
+    def judge(self) -> Judge:
+        """Of which candidates may win."""
+        setpoint, disturbance = (self.case.signals[episode].steps * self.case.sample_period for episode in EPISODES)
+        return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight)
+
+    def at_bounds(self, gains: Gains) -> dict[str, str]:
+        """The free gains that lie at a bound of the search: `lower` or `upper` by name."""
+        ends = {}
+        for name, (low, high) in zip(self.names, self.bounds, strict=True):
+            value, near = float(gains.per_lane(name)[0]), AT_BOUND * max(abs(low), abs(high))
+            if min(value - low, high - value) <= near:
+                ends[name] = "lower" if value - low <= near else "upper"
+        return ends
+
     def gains(self, candidate: Array) -> Gains:
         """The gains of one candidate, (len(names),)."""
         return self.base.with_values(**dict(zip(self.names, candidate.tolist(), strict=True)))
@@ -137,4 +210,7 @@ class TuningProblem:
             "population": self.population,
             "generations": self.generations,
             "polish": self.polish,
+            **{f"constraint.{name}": value for name, value in self.constraints.given.items()},
+            "starts": self.starts.tolist(),
+            "until_converged": self.until_converged,
         }

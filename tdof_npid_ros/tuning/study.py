@@ -3,7 +3,7 @@
 It is asked for candidates and told their values, so one study serves the offline tuner and the live one:
 
     study = Study(problem, checkpoint)
-    study.run(Objective(problem))        # or, anywhere else: study.tell(measured(study.ask())) until study.done
+    study.run(Objective(problem))        # or, anywhere else: study.tell(measured_scores(study.ask())) until study.done
     study.result.gains
 """
 
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import ControllerType, Gains
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array, Optimizer
+from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores
 from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import make_optimizer, restore_optimizer
@@ -25,11 +25,12 @@ from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
 
 
 class Improvement(NamedTuple):
-    """A generation that found a better candidate, for the convergence plot."""
+    """A generation that found a better candidate, for the convergence plot; `violation`: 0 for one that is allowed."""
 
     generation: int
     evaluations: int
     value: float
+    violation: float
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,16 @@ class TuningResult:
     Attributes:
         gains: the best candidate's.
         objective: its value (10).
+        feasible: whether it is allowed; if not, nothing that was seen is.
+        converged: whether nothing better is to be expected of a longer search.
         evaluations: candidates evaluated in all.
         improvements: how it got there.
     """
 
     gains: Gains
     objective: float
+    feasible: bool
+    converged: bool
     evaluations: int
     improvements: tuple[Improvement, ...]
 
@@ -77,8 +82,13 @@ class Study:
 
     @property
     def done(self) -> bool:
-        """Whether the budget is spent."""
-        return self._optimizer.done
+        """Whether the search is over: its budget is spent, or it has converged and was to end then."""
+        return self._optimizer.done or (self.problem.until_converged and self.converged)
+
+    @property
+    def converged(self) -> bool:
+        """Whether nothing better is to be expected of a longer search; only the HGA's tells."""
+        return self._optimizer.converged
 
     @property
     def generation(self) -> int:
@@ -97,36 +107,45 @@ class Study:
 
     @property
     def best_value(self) -> float:
-        """The lowest value so far; infinite before the first generation."""
+        """The objective of the best so far; infinite before the first generation."""
         return self._optimizer.best_value
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the best so far is allowed: a stable loop that comes to rest with the margins asked for."""
+        return self._optimizer.best_violation == 0.0
 
     @property
     def result(self) -> TuningResult:
         """The best so far. Raises TuningError before the first generation."""
         gains = self.problem.gains(self._optimizer.best_x)
-        return TuningResult(gains, self.best_value, self.evaluations, tuple(self._improvements))
+        return TuningResult(
+            gains, self.best_value, self.feasible, self.converged, self.evaluations, tuple(self._improvements)
+        )
 
     def ask(self) -> Array:
         """The generation's candidates, (n, len(problem.names)); the same ones until they are told."""
         return self._optimizer.ask()
 
-    def tell(self, values: Array) -> None:
-        """Take the values (n,) of the candidates asked, and save the checkpoint.
+    def tell(self, scores: Scores) -> None:
+        """Take the scores of the candidates asked, and save the checkpoint.
 
         Raises:
-            TuningError: not one finite value per candidate, or the checkpoint cannot be written.
+            TuningError: not one finite score per candidate, or the checkpoint cannot be written.
         """
-        before = self.best_value
-        self._optimizer.tell(values)
-        if self.best_value < before:
-            self._improvements.append(Improvement(self.generation, self.evaluations, self.best_value))
+        optimizer = self._optimizer
+        before = optimizer.best_violation, optimizer.best_value
+        optimizer.tell(scores)
+        after = optimizer.best_violation, optimizer.best_value
+        if after < before:
+            self._improvements.append(Improvement(self.generation, self.evaluations, *reversed(after)))
         self._save()
 
-    def run(self, evaluate: Callable[[Array], Array], after_generation: Callable[[Study], bool] | None = None) -> None:
-        """Run until the budget is spent, or until `after_generation` returns False.
+    def run(self, evaluate: Callable[[Array], Scores], after_generation: Callable[[Study], bool] | None = None) -> None:
+        """Run until the study is done, or until `after_generation` returns False.
 
         Args:
-            evaluate: candidates (n, d) to their values (n,).
+            evaluate: candidates (n, d) to their scores.
             after_generation: called with the study after each generation; whether to go on.
         """
         while not self.done:
@@ -145,6 +164,8 @@ class Study:
             population=problem.population,
             generations=problem.generations,
             polish=problem.polish,
+            logarithmic=problem.logarithmic,
+            starts=problem.starts,
         )
 
     def _save(self) -> None:

@@ -19,7 +19,7 @@ from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType
 from tdof_npid_ros.parameter_file import read_parameters
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
@@ -27,7 +27,7 @@ from tdof_npid_ros.tuning.study import Study
 CASES = {"/p1": "p1-c0.5", "/p1_too": "p1-c0.5", "/p3": "p3-c1"}
 SHORT = {"setpoint": ("0 setpoint 1", "0.8 end"), "disturbance": ("0 disturbance 1", "0.7 end")}
 QUICK: dict[str, Any] = {"population": 5, "generations": 4, "polish": 5}
-Visited = list[tuple[list[list[float]], list[float]]]
+Visited = list[tuple[list[list[float]], list[float], list[float]]]
 
 
 def short(case: str) -> Case:
@@ -38,13 +38,13 @@ def problem(case: str = "p1-c0.5", kind: ControllerType = "tdof_npid2", seed: in
     return TuningProblem(short(case), kind, seed=seed, **{**QUICK, **options})
 
 
-def visited(study: Study, evaluate: Callable[[Array], Array], after: Callable[[Study], bool] | None = None) -> Visited:
+def visited(study: Study, evaluate: Callable[[Array], Scores], after: Callable[[Study], bool] | None = None) -> Visited:
     """Every generation's candidates and values, as the study runs."""
     seen: Visited = []
 
-    def noted(candidates: Array) -> Array:
+    def noted(candidates: Array) -> Scores:
         values = evaluate(candidates)
-        seen.append((candidates.tolist(), values.tolist()))
+        seen.append((candidates.tolist(), values.objective.tolist(), values.violation.tolist()))
         return values
 
     study.run(noted, after)

@@ -36,7 +36,7 @@ def test_a_study_spends_its_budget_and_no_more() -> None:
     result = tune_case(CASE, "pid", population=10, generations=7)
     assert result.evaluations == 70
     assert result.objective == result.improvements[-1].value
-    values = [one.value for one in result.improvements]
+    values = [(one.violation, one.value) for one in result.improvements]
     assert values == sorted(values, reverse=True)
 
 
@@ -45,10 +45,10 @@ def test_the_result_is_the_best_candidate_that_was_told() -> None:
     objective = Objective(PROBLEM)
     while not study.done:
         candidates = study.ask()
-        values = objective(candidates)
-        seen += list(zip(values.tolist(), candidates.tolist(), strict=True))
-        study.tell(values)
-    value, candidate = min(seen)
+        scores = objective(candidates)
+        seen += list(zip(scores.values.tolist(), scores.objective.tolist(), candidates.tolist(), strict=True))
+        study.tell(scores)
+    _, value, candidate = min(seen)
     assert study.result.objective == value
     assert study.result.gains == PROBLEM.gains(np.array(candidate))
 
@@ -124,7 +124,7 @@ def damaged(text: str) -> dict[str, str]:
         "cut": text[: len(text) // 2],
         "another digit": text.replace("0.5", "0.6", 1),
         "changed": json.dumps(changed),
-        "newer": json.dumps({**document, "version": 2}),
+        "newer": json.dumps({**document, "version": 99}),
         "not a checkpoint": json.dumps({"kp": 1.0}),
         "a list": "[1, 2]",
         "not text": "\udcff\udcfe",

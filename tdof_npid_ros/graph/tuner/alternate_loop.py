@@ -16,12 +16,10 @@ from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
-from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.live import LoopLostError
-from tdof_npid_ros.tuning.objective import objective_values
 from tdof_npid_ros.tuning.problem import TuningProblem
 
 POLL = 0.02  # s between two looks at a trial
@@ -83,15 +81,16 @@ class AlternateLoop:
         """The namespace, once the loop has been seen to run."""
         return [self._namespace] if self._good is not None else []
 
-    def evaluate(self, candidates: Array) -> Array:
-        """The IAE (n,) of a step of 1 of candidates (n, gains); failed ones get the penalty of a diverged lane.
+    def evaluate(self, candidates: Array) -> Scores:
+        """Scores of candidates (n, gains) by the IAE of a step of 1; see `Trial`.
 
         Raises:
             TuningError: the loop is not there, does not settle with the last good gains, or refused a gain.
         """
         if self._good is None:
             self._begin()
-        return np.array([self._evaluate_one(candidate) for candidate in candidates])
+        values, violations = np.array([self._evaluate_one(candidate) for candidate in candidates]).T
+        return Scores(values, violations)
 
     def restore(self, gains: Gains | None) -> None:
         """Set these gains, or the last good ones."""
@@ -120,7 +119,7 @@ class AlternateLoop:
         self._good = gains_from_mapping(self._controller.parameters(GAIN_NAMES))
         self._limits = self._good.integral_min, self._good.integral_max
 
-    def _evaluate_one(self, candidate: Array) -> float:
+    def _evaluate_one(self, candidate: Array) -> tuple[float, float]:
         self._settle_with_good_gains()
         trial = Trial(self._test, self._level, next(level for level in self._test.levels if level != self._level))
         self._watch(trial)
@@ -131,12 +130,10 @@ class AlternateLoop:
         else:
             self._node.get_logger().warning(f"candidate {candidate.tolist()} was {trial.outcome}: back to good gains")
             self._recover()
-        result = Integrals(np.array([trial.iae]), np.array([trial.fraction]))
-        nothing = Integrals(np.zeros(1), np.ones(1))
-        value = float(objective_values(result, nothing, 0.0)[0])
-        if trial.outcome == "measured" and value < self._best:
-            self._best, self._good = value, self._problem.gains(candidate)
-        return value
+        score = trial.value, trial.violation
+        if trial.violation == 0.0 and trial.value < self._best:
+            self._best, self._good = trial.value, self._problem.gains(candidate)
+        return score
 
     def _settle_with_good_gains(self) -> None:
         self._controller.set_parameters(self._settings(self._good_gains))

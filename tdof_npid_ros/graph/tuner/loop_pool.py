@@ -14,9 +14,9 @@ from rclpy.node import Node
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.graph.tuner.loop_client import LoopClient, WrongCaseError
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.live import LoopLostError, measure
-from tdof_npid_ros.tuning.objective import objective_values
+from tdof_npid_ros.tuning.objective import scores
 from tdof_npid_ros.tuning.problem import TuningProblem
 
 OWN_LOOP, EVERY_LOOP = ".", "*"
@@ -85,14 +85,13 @@ class LoopPool:
         """Namespaces of the loops in use."""
         return [namespace for namespace, loop in self._loops.items() if not loop.why_out]
 
-    def evaluate(self, candidates: Array) -> Array:
-        """The objective's values (n,) of candidates (n, gains).
+    def evaluate(self, candidates: Array) -> Scores:
+        """The scores of candidates (n, gains).
 
         Raises:
             TuningError: no loop can be used, or a controller refused a gain.
         """
-        setpoint, disturbance = measure(candidates, self._usable, self._on_lost)
-        return objective_values(setpoint, disturbance, self._problem.weight)
+        return scores(self._problem, candidates, *measure(candidates, self._usable, self._on_lost))
 
     def restore(self, gains: Gains | None) -> None:
         """Set these gains, or those before the tuning, and one lane on every loop in use."""

@@ -39,7 +39,7 @@ from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
 from tdof_npid_ros.parameters import BOUNDS, TUNER
 from tdof_npid_ros.tuning.alternate import StepTest
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
@@ -59,8 +59,8 @@ class Evaluator(Protocol):
         """Namespaces of the loops in use."""
         ...
 
-    def evaluate(self, candidates: Array) -> Array:
-        """Values (n,) of candidates (n, gains)."""
+    def evaluate(self, candidates: Array) -> Scores:
+        """Scores of candidates (n, gains)."""
         ...
 
     def restore(self, gains: Gains | None) -> None:
@@ -229,7 +229,7 @@ class TunerNode(LoopNode):
         """Measure the optimum once more, alone."""
         self._publish_progress()
         result = self.study.result
-        value = float(self.evaluator.evaluate(candidate_of(self.problem, result.gains))[0])
+        value = float(self.evaluator.evaluate(candidate_of(self.problem, result.gains)).objective[0])
         if value == result.objective:
             self.get_logger().info(f"confirmed: the controller has the optimum, objective {value:.6g}")
         else:
