@@ -19,6 +19,7 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 
 # The reference of the parameters, from their tables.
 docs/parameters.md: tdof_npid_ros/parameter.py tdof_npid_ros/parameters.py tdof_npid_ros/reference.py $(VENV)/.run

@@ -36,6 +36,7 @@ TEST = [
     "hypothesis",
     "ruff",
     "mypy",
+    "import-linter>=2.4",
     "types-PyYAML",
     "scipy-stubs",
     "rosbags",

@@ -1,1 +1,7 @@
 """What the project claims about speed and quality, measured: `make bench`."""
+
+MODULES = (
+    "loop_speed", "tuning", "tuning_time", "test_functions", "lockstep", "live_tuning", "recorder", "writer",
+    "reader", "realtime", "startup", "growth",
+)  # fmt: skip
+LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only

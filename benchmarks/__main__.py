@@ -8,14 +8,9 @@ import json
 import sys
 from pathlib import Path
 
+from benchmarks import LONG, MODULES
 from benchmarks.harness import Result, measure, text
 from benchmarks.page import DATA, read_results, write_page
-
-MODULES = (
-    "loop_speed", "tuning", "tuning_time", "test_functions", "lockstep", "live_tuning", "recorder", "writer",
-    "reader", "realtime", "startup", "growth",
-)  # fmt: skip
-LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from benchmarks import LONG, MODULES
 from benchmarks.harness import Curve, Dots, Rate, Result
 
 DATA = "results.json"
@@ -28,8 +29,6 @@ def read_results(folder: Path) -> dict[str, Result]:
 
 def write_page(results: Mapping[str, Result], folder: Path) -> None:
     """Write `RESULTS.md`, `results.json` and `pictures/<benchmark>.png` into a folder."""
-    from benchmarks.__main__ import LONG, MODULES
-
     (folder / "pictures").mkdir(parents=True, exist_ok=True)
     ordered = {name: results[name] for name in (*MODULES, *LONG) if name in results}
     content = json.dumps({name: result.as_dict() for name, result in ordered.items()}, indent=1, ensure_ascii=False)

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdof_npid_ros.control.gains import LARGEST_SIGNAL
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameters import LARGEST_SIGNAL
 
 SIGNALS = ("setpoint", "disturbance")
 PLANT = "plant."  # before the names of the plant's parameters
