@@ -19,7 +19,8 @@ from tdof_npid_ros.parameter import Table
 from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
 from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import Plant, plant_at_start
+from tdof_npid_ros.responses import largest_step
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
 Bounds = tuple[float, float]
@@ -122,15 +123,16 @@ class Case:
         return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
 
     def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:
-        """Metrics of the episode `setpoint`: a step of the setpoint at its start, from 0.
+        """Metrics of the episode `setpoint`: a step of the setpoint at its start, from the output there.
 
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
         y, setpoint, disturbance = self._response("setpoint", gains)
-        if setpoint == 0.0 or disturbance != 0.0:
-            raise _no_single_step(self, "setpoint", f"the setpoint is {setpoint:g} and the disturbance {disturbance:g}")
-        return setpoint_metrics(y, 0.0, setpoint, self.sample_period)
+        if np.isclose(setpoint, y[0]) or disturbance != 0.0:
+            told = f"the setpoint is {setpoint:g} and the disturbance {disturbance:g}, the output begins at {y[0]:g}"
+            raise _no_single_step(self, "setpoint", told)
+        return setpoint_metrics(y, float(y[0]), setpoint, self.sample_period, self.options.turn)
 
     def disturbance_response(self, gains: Gains | None = None) -> DisturbanceMetrics:
         """Metrics of the episode `disturbance`: a step of the disturbance at its start, the setpoint held.
@@ -143,7 +145,22 @@ class Case:
             raise _no_single_step(
                 self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
             )
-        return disturbance_metrics(y, setpoint, self.sample_period)
+        return disturbance_metrics(y, setpoint, self.sample_period, self.largest_setpoint_step, self.options.turn)
+
+    @cached_property
+    def largest_setpoint_step(self) -> float:
+        """Of all episodes, the first step of each from the output at its start; 0 where the setpoint never steps."""
+        steps = [
+            largest_step(
+                signals.setpoint,
+                plant_at_start(
+                    self.plant_at, signals.start, signals.segments[0].plant, self.effort_limits
+                ).initial_output,
+                self.options.turn,
+            )
+            for signals in self.signals.values()
+        ]
+        return max(steps, default=0.0)
 
     def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float, float]:
         """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start

@@ -6,6 +6,7 @@
     /pid/controller_state:dof_states[elbow].feedback    of an array of messages the one that bears the name
     /imu/data sensor_msgs/msg/Imu angular_velocity.z    with the type, for a topic that nobody publishes yet
     /joint_states:position                              all elements, with their names
+    /pid/controller_state:dof_states.feedback           likewise, of an array of messages
 
 An index of digits is a place, counted from 0; anything else is a name. In quotes, `['0']`, digits are a name too.
 """
@@ -123,11 +124,11 @@ class FieldPath:
         value, parents = message, [message]
         for step in self.steps:
             if _is_array(value):
-                raise self._wrong(f"{step.field} is asked of an array: choose an element of it, as in [0]")
-            if not _has(value, step.field):
-                raise self._wrong(f"no field {step.field!r}: there are {', '.join(_fields(value)) or 'none'}")
-            value = _get(value, step.field)
-            names = ()
+                value = [self._field(element, step) for element in value]
+                if step.element is not None or (len(value) and _is_array(value[0])):
+                    raise self._wrong(f"{step.field} is asked of an array: choose an element of that, as in [0]")
+                continue
+            value = self._field(value, step)
             if _is_array(value):
                 names = _names(value, parents)
                 if step.element is not None:
@@ -146,14 +147,17 @@ class FieldPath:
         """
         value = message
         for step in self.steps:
-            if not _has(value, step.field):
-                raise self._wrong(f"no field {step.field!r}: there are {', '.join(_fields(value)) or 'none'}")
-            value = _get(value, step.field)
+            value = self._field(value, step)
             if _is_array(value):
                 return  # what is in it, only messages tell
             if step.element is not None:
                 raise self._wrong(f"{step.field} is no array, so it has no element {step.element}")
         self._numbers(value)
+
+    def _field(self, message: Any, step: Step) -> Any:
+        if not _has(message, step.field):
+            raise self._wrong(f"no field {step.field!r}: there are {', '.join(_fields(message)) or 'none'}")
+        return _get(message, step.field)
 
     def _place(self, step: Step, count: int, names: Sequence[str]) -> int:
         if isinstance(step.element, int):

@@ -1,14 +1,19 @@
-"""The paper's measures of a response (section 4), from sampled arrays."""
+"""The paper's measures of a response (section 4), from sampled arrays.
+
+With `turn` above 0, setpoint and output are angles: a difference is the shorter way round a circle of `turn`.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 SETTLING_BAND = 0.05  # of the setpoint step
 RECOVERY_BAND = 0.02  # of the setpoint step
-CONFIRMED_SHARE = 0.05  # of the episode, at its end: a response is settled once it has stayed in its band this long
+CONFIRMED_SHARE = 0.05  # of the response, at its end: it is settled once it has stayed in its band this long
+NO_BAND = "no setpoint step is known that the 2 % band would be a fraction of"
 
 
 @dataclass(frozen=True)
@@ -31,42 +36,74 @@ class DisturbanceMetrics:
     reason: str | None = None
 
 
-def integral_absolute_error(setpoint: np.ndarray, output: np.ndarray, sample_period: float) -> float:
+def difference(a: np.ndarray | float, b: np.ndarray | float, turn: float = 0.0) -> np.ndarray:
+    """a - b, as angles within half a turn."""
+    plain = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
+    return plain - turn * np.floor(plain / turn + 0.5) if turn > 0 else plain
+
+
+def integral_absolute_error(
+    setpoint: np.ndarray, output: np.ndarray, sample_period: float, turn: float = 0.0
+) -> float:
     """IAE (9) by the trapezoidal rule; setpoint and output of shape (steps,), in the output's unit; result in
-    unit·s."""
-    error = np.abs(setpoint - output)
+    unit·s, 0 for a single sample."""
+    error = np.abs(difference(setpoint, output, turn))
+    if error.size < 2:
+        return 0.0
     error[0] *= 0.5
     error[-1] *= 0.5
     return float(np.cumsum(error)[-1] * sample_period)  # summed in the order of time, as the closed loop does
 
 
-def setpoint_metrics(output: np.ndarray, before: float, after: float, sample_period: float) -> SetpointMetrics:
+def setpoint_metrics(
+    output: np.ndarray, before: float, after: float, sample_period: float, turn: float = 0.0
+) -> SetpointMetrics:
     """Metrics of the response `output` (steps,) to a setpoint step from `before` to `after` at its first sample.
 
     Raises:
         ValueError: there is no step.
     """
-    size = after - before
+    size = float(difference(after, before, turn))
     if size == 0:
         raise ValueError("the setpoint does not step: a setpoint response needs before != after")
-    overshoot = max(0.0, float(np.max((output - after) / size)) * 100.0)
-    settling, reason = _last_outside(np.abs(output - after) > SETTLING_BAND * abs(size), sample_period, "settle", "5")
-    return SetpointMetrics(
-        overshoot, settling, integral_absolute_error(np.full(output.shape, after), output, sample_period), reason
-    )
+    beyond = _beyond_the_target(output, before, size, turn) if turn > 0 else (output - after) / size
+    overshoot = max(0.0, float(np.max(beyond)) * 100.0)
+    outside = np.abs(difference(output, after, turn)) > SETTLING_BAND * abs(size)
+    settling, reason = _last_outside(outside, sample_period, "settle", "5")
+    iae = integral_absolute_error(np.full(output.shape, after), output, sample_period, turn)
+    return SetpointMetrics(overshoot, settling, iae, reason)
 
 
 def disturbance_metrics(
-    output: np.ndarray, setpoint: float, sample_period: float, setpoint_step: float = 1.0
+    output: np.ndarray, setpoint: float, sample_period: float, setpoint_step: float | None = 1.0, turn: float = 0.0
 ) -> DisturbanceMetrics:
-    """Metrics of the response `output` (steps,) to a disturbance from its first sample on, the setpoint held."""
-    deviation = np.abs(output - setpoint)
+    """Metrics of the response `output` (steps,) to a disturbance from its first sample on, the setpoint held.
+
+    Args:
+        setpoint_step: what the recovery band is a fraction of; None: not known, so there is no recovery time.
+    """
+    deviation = np.abs(difference(output, setpoint, turn))
+    iae = integral_absolute_error(np.full(output.shape, setpoint), output, sample_period, turn)
+    if not setpoint_step:
+        return DisturbanceMetrics(float(deviation.max()), None, iae, NO_BAND)
     band = RECOVERY_BAND * abs(setpoint_step)
     recovery, reason = _last_outside(deviation > band, sample_period, "recover", "2")
     if reason is None and recovery == 0.0:
         reason = f"the deviation never left the 2 % band (±{band:g})"
-    iae = integral_absolute_error(np.full(output.shape, setpoint), output, sample_period)
     return DisturbanceMetrics(float(deviation.max()), recovery, iae, reason)
+
+
+def _beyond_the_target(output: np.ndarray, before: float, size: float, turn: float) -> np.ndarray:
+    """How far an angle is beyond the setpoint, as a fraction of the step, along the way that it went.
+
+    A loop may go the longer way round; then that is the way to measure.
+    """
+    steps = difference(output, np.concatenate([[before], output[:-1]]), turn)
+    way = np.cumsum(steps)
+    other = size - math.copysign(turn, size)
+    there, round_ = (np.flatnonzero(way * np.sign(target) >= abs(target)) for target in (size, other))
+    target = other if round_.size and (not there.size or round_[0] < there[0]) else size
+    return (way - target) / target
 
 
 def _last_outside(outside: np.ndarray, period: float, verb: str, band: str) -> tuple[float | None, str | None]:
@@ -77,6 +114,6 @@ def _last_outside(outside: np.ndarray, period: float, verb: str, band: str) -> t
     if last[-1] >= (1 - CONFIRMED_SHARE) * (outside.size - 1):
         return None, (
             f"does not {verb}: outside the {band} % band {last[-1] * period:g} s after the step, "
-            f"too near the episode's end ({(outside.size - 1) * period:g} s)"
+            f"too near the response's end ({(outside.size - 1) * period:g} s)"
         )
     return float((last[-1] + 1) * period), None

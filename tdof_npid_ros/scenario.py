@@ -333,11 +333,12 @@ def _unroll(entries: list[_Entry], names: list[str], period_ns: int) -> Plan:
 
 
 def _stops(entries: Sequence[_Entry]) -> list[int]:
-    """For each entry but the last, the end, when the signal's next one begins, or else the end."""
+    """For each entry but the last, the end, when the signal's next one begins, or else just after the end: what the end
+    cuts off has a value there too."""
     following: dict[str, int] = {}
     stops = []
     for entry in reversed(entries[:-1]):
-        stops.append(following.get(entry.signal, entries[-1].time_ns))
+        stops.append(following.get(entry.signal, entries[-1].time_ns + 1))
         following[entry.signal] = entry.time_ns
     return stops[::-1]
 

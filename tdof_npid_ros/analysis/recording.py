@@ -55,29 +55,31 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Loop:
-    """One closed loop in a bag, or a robot's joint states alone.
+class Surroundings:
+    """What a bag tells of a loop besides its signals.
 
     Attributes:
         bag: its path, for messages.
-        namespace: ends with a slash.
-        topic: the output's.
-        output: what is controlled; `effort` the effort really applied.
-        control_effort: the controller's answers; None in a bag without.
-        disturbance, setpoint: as published live; None in a bag without.
+        namespace: of plant, controller and scenario; ends with a slash.
         plans: by digest.
         histories: the parameters of every node in the bag, by its full name.
     """
 
     bag: str
     namespace: str
-    topic: str
-    output: Signal
-    control_effort: Signal | None
-    setpoint: Signal | None
-    disturbance: Signal | None
     plans: Mapping[str, Plan]
     histories: Mapping[str, ParameterHistory]
+
+    @classmethod
+    def read(
+        cls, reader: BagReader, bag: str, namespace: str, histories: Mapping[str, ParameterHistory]
+    ) -> Surroundings:
+        """Of the loop in a namespace.
+
+        Raises:
+            BagError: the bag is damaged.
+        """
+        return cls(bag, namespace, _plans(reader, f"{namespace}scenario_plan"), histories)
 
     @cached_property
     def plant(self) -> ParameterHistory | None:
@@ -98,6 +100,21 @@ class Loop:
         return None
 
 
+@dataclass(frozen=True)
+class Loop(Surroundings):
+    """One closed loop in a bag, with the messages of our own controller.
+
+    Attributes:
+        topic: the output's.
+        output: what is controlled; `effort` the effort really applied.
+        control_effort: the controller's answers; None in a bag without.
+    """
+
+    topic: str
+    output: Signal
+    control_effort: Signal | None
+
+
 def read_loops(reader: BagReader, bag: str) -> list[Loop]:
     """The loops in a bag: each namespace's `output`, or else any `joint_states`, or else any other JointState.
 
@@ -110,13 +127,11 @@ def read_loops(reader: BagReader, bag: str) -> list[Loop]:
         Loop(
             bag,
             namespace,
+            _plans(reader, f"{namespace}scenario_plan"),
+            histories,
             topic,
             _signal(reader, topic),
             _signal_if_there(reader, f"{namespace}control_effort"),
-            _signal_if_there(reader, f"{namespace}setpoint"),
-            _signal_if_there(reader, f"{namespace}disturbance"),
-            _plans(reader, f"{namespace}scenario_plan"),
-            histories,
         )
         for topic in _output_topics(reader, bag)
         for namespace in [topic.rpartition("/")[0] + "/"]

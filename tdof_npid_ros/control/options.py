@@ -53,6 +53,11 @@ class ControllerOptions:
         """Whether the law alone makes the effort."""
         return self == replace(PLAIN, manual_effort=self.manual_effort, bumpless=self.bumpless)
 
+    @property
+    def turn(self) -> float:
+        """A whole turn, in the output's unit; 0 where setpoint and output are no angles."""
+        return 2.0 * math.pi if self.angle else 0.0
+
     def check_lanes(self, gains: Gains) -> None:
         """Raise GainsError unless the manual effort fits the gains' lanes."""
         if isinstance(self.manual_effort, tuple) and len(self.manual_effort) != gains.lanes:

@@ -37,7 +37,7 @@ def shape_of(options: ControllerOptions, sample_period: float) -> Shape:
         options.setpoint_rate * sample_period,
         1.0 - exp_minus_of(sample_period / t) if t > 0 else 1.0,
         options.dead_band,
-        2.0 * math.pi if options.angle else 0.0,
+        options.turn,
         options.effort_rate * sample_period,
     )
 
