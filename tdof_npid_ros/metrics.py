@@ -42,9 +42,7 @@ def difference(a: np.ndarray | float, b: np.ndarray | float, turn: float = 0.0) 
     return plain - turn * np.floor(plain / turn + 0.5) if turn > 0 else plain
 
 
-def integral_absolute_error(
-    setpoint: np.ndarray, output: np.ndarray, sample_period: float, turn: float = 0.0
-) -> float:
+def integral_absolute_error(setpoint: np.ndarray, output: np.ndarray, sample_period: float, turn: float = 0.0) -> float:
     """IAE (9) by the trapezoidal rule; setpoint and output of shape (steps,), in the output's unit; result in
     unit·s, 0 for a single sample."""
     error = np.abs(difference(setpoint, output, turn))

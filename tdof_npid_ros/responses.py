@@ -62,7 +62,8 @@ class Lane:
         time: s, (samples,).
         setpoint, disturbance, output: (samples,).
         plant_changes: samples at which the plant's parameters change.
-        from_rest: the first sample is the loop's start, so setpoint and disturbance have just come.
+        setpoint_is_new: the first setpoint came with the first sample; else it stood before.
+        disturbance_is_new: likewise.
         seen_late: a change is seen at the first output after it, which may have moved already.
         largest_step: of the setpoint, in the case's scenario: what the recovery band is a fraction of.
         turn: of angles, else 0.
@@ -74,7 +75,8 @@ class Lane:
     disturbance: np.ndarray
     output: np.ndarray
     plant_changes: Collection[int] = ()
-    from_rest: bool = True
+    setpoint_is_new: bool = True
+    disturbance_is_new: bool = True
     seen_late: bool = False
     largest_step: float | None = None
     turn: float = 0.0
@@ -126,29 +128,31 @@ def _changes(lane: Lane, first: int) -> list[_Change]:
 
 def _setpoint_changes(lane: Lane, first: int) -> list[_Change]:
     r = lane.setpoint
-    found = _first_setpoint(lane, first)
-    sizes = [abs(float(difference(r[change.at], change.before, lane.turn))) for change in found]
+    moves = [(change, first + 1) for change in _first_setpoint(lane, first)]
     standing = float(r[first])
     for at, end in _moves(r[first:], first):
-        if end - at > 1:  # a path begins where it leaves the value that stood
-            found.append(_Change(max(at - 1, first), "tracking", standing))
-            sizes.append(float(np.abs(difference(r[at:end], standing, lane.turn)).max()))
-        else:
-            found.append(_Change(at, "setpoint", standing))
-            sizes.append(abs(float(difference(r[at], standing, lane.turn))))
+        # A path begins where it leaves the value that stood.
+        is_path = end - at > 1
+        moves.append((_Change(max(at - 1, first), "tracking") if is_path else _Change(at, "setpoint", standing), end))
         standing = float(r[end - 1])
+    sizes = [_extent(lane, change, end) for change, end in moves]
     smallest = max(SMALLEST_STEP * max(sizes, default=0.0), ROUNDING * float(np.nanmax(np.abs(r))))
     kept: list[_Change] = []
     standing = float(r[first])
-    for change, size in zip(found, sizes, strict=True):
+    for change, end in moves:
         if change.kind == "setpoint" and change.at > first:
             # Many small changes add up: what counts is how far it is from the value that stood.
-            size = abs(float(difference(r[change.at], standing, lane.turn)))
             change = change._replace(before=standing)
-        if size > smallest:
+        if _extent(lane, change, end) > smallest:
             kept.append(change)
-            standing = float(r[change.at])
+            standing = float(r[end - 1])
     return kept
+
+
+def _extent(lane: Lane, change: _Change, end: int) -> float:
+    """How far the setpoint goes in a change that ends before the sample `end`."""
+    before = lane.setpoint[change.at] if change.kind == "tracking" else change.before
+    return float(np.abs(difference(lane.setpoint[change.at : end], before, lane.turn)).max())
 
 
 def _first_setpoint(lane: Lane, first: int) -> list[_Change]:
@@ -156,7 +160,7 @@ def _first_setpoint(lane: Lane, first: int) -> list[_Change]:
 
     A setpoint that stood when the recording began is no step: when it came, and what the output was then, is not known.
     """
-    if first == 0 and not lane.from_rest:
+    if first == 0 and not lane.setpoint_is_new:
         return []
     y = lane.output
     before = float(y[first - 1] if lane.seen_late and first > 0 and not np.isnan(y[first - 1]) else y[first])
@@ -176,7 +180,7 @@ def _disturbance_changes(lane: Lane) -> list[tuple[int, Kind]]:
     d = lane.disturbance
     size = np.abs(d)
     largest = float(np.nanmax(size)) if size.size and not np.isnan(size).all() else 0.0
-    found: list[tuple[int, Kind]] = [(0, "disturbance")] if lane.from_rest and size[0] > 0 else []
+    found: list[tuple[int, Kind]] = [(0, "disturbance")] if lane.disturbance_is_new and size[0] > 0 else []
     for at, end in _moves(d):
         if np.abs(d[at:end] - d[at - 1]).max() > SMALLEST_STEP * largest:
             found.append((at - 1, "tracking") if end - at > 1 else (at, "disturbance"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tdof_npid_ros.metrics import disturbance_metrics, integral_absolute_error, setpoint_metrics
+from tdof_npid_ros.metrics import NO_BAND, disturbance_metrics, integral_absolute_error, setpoint_metrics
 
 H = 0.01
 T = np.arange(0, 20 + H / 2, H)
@@ -54,3 +54,37 @@ def test_recovery_counts_from_the_onset_to_the_last_exit_of_the_band() -> None:
     small = disturbance_metrics(0.01 * np.exp(-T), 0.0, H)
     assert small.recovery_time_s == 0.0
     assert small.reason and "never left" in small.reason
+
+
+def test_one_sample_has_no_area() -> None:
+    assert integral_absolute_error(np.array([1.0]), np.array([0.0]), H) == 0.0
+
+
+def test_without_a_known_step_there_is_no_band_to_recover_to() -> None:
+    for unknown in (None, 0.0):
+        metrics = disturbance_metrics(0.3 * np.exp(-T), 0.0, H, unknown)
+        assert (metrics.peak, metrics.recovery_time_s, metrics.reason) == (0.3, None, NO_BAND)
+
+
+def test_an_angle_is_measured_the_way_that_it_goes() -> None:
+    y = 1 - np.exp(-T) * np.cos(3 * T)
+    plain = setpoint_metrics(y, 0.0, 1.0, H)
+    for before, after, way in ((3.0, -3.0, 2 * np.pi - 6), (-3.0, 3.0, 6 - 2 * np.pi), (0.5, 1.0, 0.5)):
+        angle = (before + way * y + np.pi) % (2 * np.pi) - np.pi
+        turned = setpoint_metrics(angle, before, after, H, 2 * np.pi)
+        assert turned.overshoot_percent == pytest.approx(plain.overshoot_percent)
+        assert turned.settling_time_s == plain.settling_time_s
+        assert turned.iae == pytest.approx(abs(way) * plain.iae)
+
+
+def test_a_loop_that_takes_the_longer_way_round_does_not_overshoot_by_it() -> None:
+    """A step of 3.1 rad that begins with a little kick backwards, and goes on that way."""
+    y = (-(2 * np.pi - 3.1) * (1 - np.exp(-T)) + np.pi) % (2 * np.pi) - np.pi
+    metrics = setpoint_metrics(y, 0.0, 3.1, H, 2 * np.pi)
+    assert metrics.overshoot_percent < 0.01 and metrics.settling_time_s is not None
+
+
+def test_a_disturbed_angle_deviates_by_the_shorter_way() -> None:
+    y = (3.0 + 0.5 * T * np.exp(-T) + np.pi) % (2 * np.pi) - np.pi
+    metrics = disturbance_metrics(y, 3.0, H, 1.0, 2 * np.pi)
+    assert metrics.peak == pytest.approx(0.5 / np.e, rel=1e-3) and metrics.recovery_time_s is not None

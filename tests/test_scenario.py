@@ -139,3 +139,12 @@ def test_overlapping_points_within_a_sample_leave_the_last() -> None:
     sampled = plan.sampled(10_000_000)
     assert sampled.setpoint.tolist() == [0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
     assert sampled.segments == (Segment(0, 2, {"a": 1.0}), Segment(2, 5, {"a": 3.0}))
+
+
+def test_a_plan_that_ends_within_a_ramp_or_sine_samples_its_last_point() -> None:
+    ramp = parse_plan(["0 setpoint ramp 2 over 2", "1 end"], PERIOD_NS).sampled(PERIOD_NS)
+    np.testing.assert_allclose(ramp.setpoint, np.linspace(0, 1, 11))
+    sine = parse_plan(["0 setpoint sine 1 period 4 for 8", "1 end"], PERIOD_NS).sampled(PERIOD_NS)
+    np.testing.assert_allclose(sine.setpoint, np.sin(np.pi / 2 * np.arange(11) / 10))
+    whole = parse_plan(["0 setpoint ramp 1 over 1", "1 end"], PERIOD_NS).sampled(PERIOD_NS)
+    assert whole.setpoint[-1] == 1.0

@@ -1,10 +1,9 @@
-"""What an episode shows: responses to changes of setpoint, disturbance and plant, their metrics, and effort use."""
+"""What an episode's control costs, and how far the episode is from the in-process simulation."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -12,37 +11,7 @@ from tdof_npid_ros.analysis.episodes import Episode
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.law import limits_of
 from tdof_npid_ros.loop import simulate
-from tdof_npid_ros.metrics import (
-    DisturbanceMetrics,
-    SetpointMetrics,
-    disturbance_metrics,
-    integral_absolute_error,
-    setpoint_metrics,
-)
 from tdof_npid_ros.plants.plant import PlantError
-
-MOST_STEPS = 20  # an episode with more changes follows a ramp or a sine: then only its error is measured
-Kind = Literal["setpoint", "disturbance", "plant", "tracking"]
-
-
-@dataclass(frozen=True)
-class Response:
-    """What one lane does from one change to the next.
-
-    Attributes:
-        kind: what changed; `tracking`: the whole episode, for want of single steps.
-        start_s, end_s: within the episode.
-        metrics: the paper's; None for `tracking`, and where samples are missing.
-        iae: integral of the absolute error (9); None where samples are missing.
-        reason: why something is None.
-    """
-
-    kind: Kind
-    start_s: float
-    end_s: float
-    metrics: SetpointMetrics | DisturbanceMetrics | None
-    iae: float | None
-    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -67,22 +36,6 @@ class Deviation:
     output: float | None
     control_effort: float | None
     reason: str | None = None
-
-
-def responses(episode: Episode, lane: int) -> list[Response]:
-    """The responses of one lane, in order."""
-    changes = _changes(episode, lane)
-    last = len(episode.time) - 1
-    if not changes or len(changes) > MOST_STEPS:
-        return [_measured(episode, lane, "tracking", 0, last, 0.0, 1.0)]
-    found = []
-    step = 1.0  # the setpoint step that the recovery band is a fraction of; the paper's is 1
-    ends = [*(at for at, _, _ in changes[1:]), last]
-    for (first, kind, before), end in zip(changes, ends, strict=True):
-        if kind == "setpoint":
-            step = abs(episode.setpoint[first, lane] - before)
-        found.append(_measured(episode, lane, kind, first, end, before, step))
-    return found
 
 
 def effort_use(episode: Episode, lane: int) -> EffortUse:
@@ -143,43 +96,3 @@ def _limits(episode: Episode) -> tuple[float, float]:
     low, high = values.get("effort_min", -math.inf), values.get("effort_max", math.inf)
     assert isinstance(low, (int, float)) and isinstance(high, (int, float))
     return float(low), float(high)
-
-
-def _changes(episode: Episode, lane: int) -> list[tuple[int, Kind, float]]:
-    """Sample, what changes there, and the setpoint before it."""
-    r, d = episode.setpoint[:, lane], episode.disturbance
-    from_rest = episode.time[0] == 0.0  # at time 0, everything has just come from 0
-    before = np.concatenate([[0.0 if from_rest else r[0]], r[:-1]])
-    known = ~np.isnan(r) & ~np.isnan(before)
-    setpoint = set(np.flatnonzero(known & (r != before)).tolist())
-    disturbance = set(np.flatnonzero(np.diff(d, prepend=0.0 if from_rest else d[0])).tolist())
-    plant = (
-        {segment.first for segment in episode.plan.sampled(episode.sample_period_ns).segments[1:]}
-        if episode.plan is not None
-        else set()
-    )
-    kinds: dict[int, Kind] = {}
-    kinds.update(dict.fromkeys(plant, "plant"))
-    kinds.update(dict.fromkeys(disturbance, "disturbance"))
-    kinds.update(dict.fromkeys(setpoint, "setpoint"))
-    return [(k, kinds[k], float(before[k])) for k in sorted(kinds) if k < len(r) - 1]
-
-
-def _measured(episode: Episode, lane: int, kind: Kind, first: int, last: int, before: float, step: float) -> Response:
-    period = episode.sample_period_ns / 1e9
-    window = slice(first, last + 1)
-    y, r = episode.output[window, lane], episode.setpoint[window, lane]
-    start_s, end_s = float(episode.time[first]), float(episode.time[last])
-    missing = int(np.isnan(y).sum())
-    if missing:
-        return Response(kind, start_s, end_s, None, None, f"{missing} outputs are missing from the bag")
-    if np.isnan(r).any():
-        return Response(kind, start_s, end_s, None, None, "the setpoint is not in the bag")
-    if kind == "tracking":
-        return Response(kind, start_s, end_s, None, integral_absolute_error(r, y, period), "no single step")
-    metrics: SetpointMetrics | DisturbanceMetrics
-    if kind == "setpoint":
-        metrics = setpoint_metrics(y, before, float(r[0]), period)
-    else:
-        metrics = disturbance_metrics(y, float(r[0]), period, step)
-    return Response(kind, start_s, end_s, metrics, metrics.iae, metrics.reason)

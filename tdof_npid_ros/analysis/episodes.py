@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
+from tdof_npid_ros.analysis.loops import ObservedLoop, observed_loops
 from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations
-from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
+from tdof_npid_ros.analysis.tracks import Key, Track, held, matched
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.parameters import sample_period_in_ns
-from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, parse_plan, read_episodes
+from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.responses import Lane, largest_step
+from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError, parse_plan, read_episodes
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
 LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
 UNPLANNED = "recording"  # the name of an episode without a plan
+ANSWERS_BY_STAMP = 0.5  # of the efforts bear an output's stamp: then they are answers to outputs
 
 
 @dataclass(frozen=True)
@@ -35,13 +41,21 @@ class Episode:
         plan: None in a bag without, and in realtime, where setpoint and disturbance come from their topics.
         sample_period_ns: of the outputs.
         start_ns: when the first output was published, ns since the epoch.
-        time: s, (samples,).
+        first_stamp_ns: of the first output.
+        time: s from the first output on, (samples,).
+        joints: what the lanes are called, (lanes,); None for a lane without a name.
         setpoint, output, control_effort: (samples, lanes); NaN where the bag does not hold them.
-        disturbance: (samples,).
+        disturbance: (samples, lanes).
         gains: every set of controller parameters that answered, in order; empty where the bag does not hold them.
         plainly_operated: whether the control law alone made the efforts: no manual mode, rate limit, filter, …
         plant: the parameters of the simulated plant; empty where the bag does not hold them.
         missing: outputs that the plan has and the bag has not.
+        begins: by lane, whether the first setpoint came with the first output, rather than stood before.
+        from_rest: whether the loop starts with the first output.
+        largest_step: of the setpoint in the scenario; None where the bag does not tell.
+        turn: of angles, else 0.
+        notes: what was guessed or mended.
+        hint: where a setpoint might be, if none was found.
     """
 
     bag: str
@@ -51,7 +65,9 @@ class Episode:
     plan: Plan | None
     sample_period_ns: int
     start_ns: int
+    first_stamp_ns: int
     time: np.ndarray
+    joints: tuple[str | None, ...]
     setpoint: np.ndarray
     disturbance: np.ndarray
     output: np.ndarray
@@ -60,6 +76,12 @@ class Episode:
     plainly_operated: bool
     plant: Mapping[str, object]
     missing: int
+    begins: np.ndarray
+    from_rest: bool
+    largest_step: float | None
+    turn: float
+    notes: tuple[str, ...]
+    hint: str
 
     @property
     def lanes(self) -> int:
@@ -71,15 +93,32 @@ class Episode:
         """Type of the controller; empty where the bag does not tell."""
         return ", ".join(dict.fromkeys(gains.type for gains in self.gains))
 
+    def lane(self, lane: int) -> Lane:
+        """What drives one lane and what it does."""
+        segments = self.plan.sampled(self.sample_period_ns).segments[1:] if self.plan is not None else ()
+        return Lane(
+            self.sample_period_ns / 1e9,
+            self.time,
+            self.setpoint[:, lane],
+            self.disturbance[:, lane],
+            self.output[:, lane],
+            [segment.first for segment in segments],
+            setpoint_is_new=bool(self.begins[lane]),
+            disturbance_is_new=self.from_rest,
+            seen_late=self.plan is None,
+            largest_step=self.largest_step,
+            turn=self.turn,
+        )
 
-def episodes_in(reader: BagReader, path: str | Path) -> list[Episode]:
+
+def episodes_in(reader: BagReader, path: str | Path, chosen: Chosen = NOTHING_CHOSEN) -> list[Episode]:
     """The episodes in a bag, in the order in which they began; `path` is for messages.
 
     Raises:
         AnalysisError: there is no output in it, or none of two samples.
         BagError: it is damaged.
     """
-    found = [episode for loop in read_loops(reader, str(path)) for episode in _episodes(loop)]
+    found = [episode for loop in observed_loops(reader, str(path), chosen) for episode in _episodes(loop)]
     if not found:
         raise AnalysisError(f"{path}: no episode of at least two outputs in it: record longer")
     return sorted(found, key=lambda episode: episode.start_ns)
@@ -95,101 +134,149 @@ def bag_names(bags: Iterable[str]) -> dict[str, str]:
     return {bag: "/".join(path[len(path) - depth :]) for bag, path in parts.items()}
 
 
-def _episodes(loop: Loop) -> Iterator[Episode]:
-    names = _plan_names(loop.scenario, loop.plans)
-    answers = loop.control_effort
-    by_episode: dict[EpisodeLabel | None, list[slice]] = defaultdict(list)
-    for stretch in _stretches(answers) if answers is not None else []:
-        by_episode[_episode_of(answers, stretch)].append(stretch)  # type: ignore[arg-type]
+def _episodes(loop: ObservedLoop) -> Iterator[Episode]:
+    answers = _Answers.of(loop.effort)
+    output = _without_lone_zeros(loop.output)
     known = configurations(loop.histories)
-    for count, stretch in enumerate(_stretches(loop.output), start=1):
-        label = _episode_of(loop.output, stretch)
-        if label is not None:
-            mine = by_episode[label].pop(0) if by_episode[label] else slice(0, 0)
-        else:
-            mine = _published_during(loop.output, stretch, answers)
-        episode = _episode(loop, stretch, label, count, answers, mine, known, names)
+    names = _plan_names(loop.scenario, loop.plans)
+    driven = _driven(loop)
+    for count, stretch in enumerate(_stretches(output), start=1):
+        label = _episode_of(output, stretch)
+        mine = answers.published_during(output, stretch) if label is None else answers.of_episode(label)
+        view = _View(loop, output.only(np.arange(stretch.start, stretch.stop)), label, mine, driven)
+        episode = _episode(view, count, known, names)
         if episode is not None:
             yield episode
 
 
-def _stretches(signal: Signal) -> list[slice]:
+class _View(NamedTuple):
+    """A stretch of a loop.
+
+    Attributes:
+        output: of the stretch alone.
+        label: the episode that its messages name.
+        answers: indices of the efforts that belong to it.
+        driven: the joints that have a setpoint or effort; empty: not known.
+    """
+
+    loop: ObservedLoop
+    output: Track
+    label: EpisodeLabel | None
+    answers: np.ndarray
+    driven: frozenset[Key]
+
+
+class _Answers:
+    """The efforts of a loop by the episodes that they name."""
+
+    def __init__(self, effort: Track | None) -> None:
+        self._effort = effort
+        self._by_episode: dict[EpisodeLabel | None, list[slice]] = defaultdict(list)
+
+    @classmethod
+    def of(cls, effort: Track | None) -> _Answers:
+        answers = cls(effort)
+        for stretch in _stretches(effort) if effort is not None else []:
+            assert effort is not None
+            answers._by_episode[_episode_of(effort, stretch)].append(stretch)
+        return answers
+
+    def of_episode(self, label: EpisodeLabel) -> np.ndarray:
+        """The next answers to an episode of this label."""
+        stretches = self._by_episode[label]
+        mine = stretches.pop(0) if stretches else slice(0, 0)
+        return np.arange(mine.start, mine.stop)
+
+    def published_during(self, output: Track, stretch: slice) -> np.ndarray:
+        """What was received from the stretch's first output on, until the next stretch's."""
+        if self._effort is None:
+            return np.arange(0)
+        times = self._effort.receive_ns
+        mine = times >= output.receive_ns[stretch.start]
+        if stretch.stop < len(output):
+            mine &= times < output.receive_ns[stretch.stop]
+        return np.flatnonzero(mine)
+
+
+def _driven(loop: ObservedLoop) -> frozenset[Key]:
+    """The joints that are controlled; empty where nothing tells by name."""
+    found: set[Key] = set()
+    for track in (loop.acted_on, loop.setpoint, loop.effort):
+        if track is not None and track.bears_names:
+            found |= track.driven()
+        elif track is not None and track.layouts and track is not loop.effort:
+            return frozenset()  # by place, so that it is for all
+    return frozenset(found & set(loop.output.keys))
+
+
+def _without_lone_zeros(output: Track) -> Track:
+    """The track without messages whose stamp alone is not set."""
+    stamps = output.stamp_ns
+    if len(stamps) < 3:
+        return output
+    lone = np.zeros(len(stamps), bool)
+    lone[1:-1] = (stamps[1:-1] == 0) & (stamps[:-2] > 0) & (stamps[2:] > stamps[:-2])
+    if lone.any():
+        lone &= np.array([EpisodeLabel.parse(str(frame)) is None for frame in output.frame_id.tolist()])
+    return output.only(np.flatnonzero(~lone)) if lone.any() else output
+
+
+def _stretches(track: Track) -> list[slice]:
     """Stretches of one episode each: the frame_id's episode stays the same, no stamp goes back to a start or far
     ahead."""
-    if not len(signal):
+    if not len(track):
         return []
-    stamps = signal.stamp_ns
+    stamps = track.stamp_ns
     back = (stamps[1:] < stamps[:-1]) & ((stamps[1:] == 0) | (stamps[:-1] - stamps[1:] > FAR_NS))
     starts = {0, *(np.flatnonzero(back) + 1).tolist()}
     steps = np.diff(stamps)
     gap_ns = max(LONGEST_GAP_NS, LONGEST_GAP_PERIODS * int(np.median(steps))) if len(steps) else LONGEST_GAP_NS
     ahead = (np.flatnonzero(steps > gap_ns) + 1).tolist()
-    starts |= {first for first in ahead if _episode_of(signal, slice(first, first + 1)) is None}
-    runs = signal.runs()
-    for before, run in zip(runs, runs[1:], strict=False):
-        if _episode_of(signal, before) != _episode_of(signal, run):
-            starts.add(run.start)
-    ordered = [*sorted(starts), len(signal)]
+    starts |= {first for first in ahead if _episode_of(track, slice(first, first + 1)) is None}
+    for change in (np.flatnonzero(track.frame_id[1:] != track.frame_id[:-1]) + 1).tolist():
+        if _episode_of(track, slice(change - 1, change)) != _episode_of(track, slice(change, change + 1)):
+            starts.add(change)
+    ordered = [*sorted(starts), len(track)]
     return [slice(a, b) for a, b in zip(ordered, ordered[1:], strict=False)]
 
 
-def _episode_of(signal: Signal, stretch: slice) -> EpisodeLabel | None:
+def _episode_of(track: Track, stretch: slice) -> EpisodeLabel | None:
     """The episode that an output or an answer names."""
-    return EpisodeLabel.named_in(str(signal.frame_id[stretch.start]))
+    return EpisodeLabel.named_in(str(track.frame_id[stretch.start]))
 
 
-def _published_during(output: Signal, stretch: slice, answers: Signal | None) -> slice:
-    if answers is None:
-        return slice(0, 0)
-    first = int(output.publish_ns[stretch.start])
-    after = int(output.publish_ns[stretch.stop]) if stretch.stop < len(output) else None
-    a = int(np.searchsorted(answers.publish_ns, first))
-    return slice(a, len(answers) if after is None else int(np.searchsorted(answers.publish_ns, after)))
-
-
-def _episode(
-    loop: Loop,
-    stretch: slice,
-    label: EpisodeLabel | None,
-    count: int,
-    answers: Signal | None,
-    mine: slice,
-    known: Mapping[str, Configuration],
-    names: Mapping[str, str],
-) -> Episode | None:
-    stamps, first = np.unique(loop.output.stamp_ns[stretch], return_index=True)
-    if len(stamps) < 2:
-        return None
-    rows = _rows(loop.output.position[stretch], loop.bag)[first]
-    if not rows.shape[1]:
+def _episode(view: _View, count: int, known: Mapping[str, Configuration], names: Mapping[str, str]) -> Episode | None:
+    loop, output = view.loop, view.output
+    keys = [key for key in output.keys if key in view.driven] or list(output.keys)
+    stamps, first = np.unique(output.stamp_ns, return_index=True)
+    if len(stamps) < 2 or not keys:
         return None
     period_ns = int(np.median(np.diff(stamps)))
-    digest = label.plan if label is not None else ""
+    digest = view.label.plan if view.label is not None else ""
     plan = loop.plans.get(digest)
     grid = _grid(stamps, period_ns, plan, loop.bag)
     hold = not digest
-    output = _on_grid(grid, stamps, rows, hold)
-    setpoint, effort = np.full((2, *output.shape), np.nan)
-    digests: list[str] = []
-    if answers is not None and mine.stop > mine.start:
-        effort_stamps, index = np.unique(answers.stamp_ns[mine], return_index=True)
-        effort_rows, setpoint_rows = (_rows(c[mine], loop.bag)[index] for c in (answers.effort, answers.position))
-        effort = _on_grid(grid, effort_stamps, _widened(effort_rows, output), hold)
-        setpoint = _on_grid(grid, effort_stamps, _widened(setpoint_rows, output), hold)
-        changes = np.flatnonzero(answers.frame_id[mine][1:] != answers.frame_id[mine][:-1]) + 1
-        digests = [AnswerLabel.parse(str(answers.frame_id[mine][i])).parameters for i in (0, *changes)]
-    used = [known[name] for name in digests] if set(digests) <= known.keys() else []
-    start_ns = int(loop.output.publish_ns[stretch.start])
+    sampling = _Sampling(grid, period_ns, output, stamps, first, hold)
+    rows = output.table(keys)
+    y = sampling.by_stamp(stamps, (held(rows) if hold else rows)[first])
+    effort = sampling.of_answers(loop.effort, view.answers, keys)
+    start_ns = int(output.receive_ns[0])
+    used = _used(loop, view.answers, known)
+    from_rest = int(grid[0]) == 0
+    begins = np.full(len(keys), from_rest)
     if plan is not None:
         signals = plan.sampled(period_ns)
-        setpoint = np.repeat(signals.setpoint[:, None], output.shape[1], axis=1)
-        disturbance = signals.disturbance
+        setpoint, disturbance = (
+            np.repeat(values[:, None], len(keys), axis=1) for values in (signals.setpoint, signals.disturbance)
+        )
     else:
-        if np.isnan(setpoint).all() and loop.setpoint is not None:
-            setpoint = np.repeat(
-                _live(loop.setpoint, "position", loop, stretch, grid)[:, None], output.shape[1], axis=1
-            )
-        disturbance = _live(loop.disturbance, "effort", loop, stretch, grid)
+        setpoint = sampling.of_answers(loop.acted_on, view.answers, keys)
+        live, is_new = sampling.live(loop.setpoint, keys)
+        unknown = np.isnan(setpoint).all(axis=0)
+        setpoint[:, unknown] = live[:, unknown]
+        begins[unknown] |= is_new[unknown]
+        disturbance = np.nan_to_num(sampling.live(loop.disturbance, keys)[0])  # before the first there is none
+    plant = loop.plant.at(start_ns) if loop.plant is not None else {}
     return Episode(
         bag=loop.bag,
         namespace=loop.namespace,
@@ -198,33 +285,118 @@ def _episode(
         plan=plan,
         sample_period_ns=period_ns,
         start_ns=start_ns,
-        time=grid / 1e9,
+        first_stamp_ns=int(grid[0]),
+        time=(grid - grid[0]) / 1e9,
+        joints=tuple(key if isinstance(key, str) else None for key in keys),
         setpoint=setpoint,
         disturbance=disturbance,
-        output=output,
+        output=y,
         control_effort=effort,
         gains=tuple(configuration.gains for configuration in used),
         plainly_operated=all(configuration.options.is_plain for configuration in used),
-        plant=loop.plant.at(start_ns) if loop.plant is not None else {},
-        missing=int(np.isnan(output).any(axis=1).sum()),
+        plant=plant,
+        missing=int(np.isnan(y).any(axis=1).sum()),
+        begins=begins,
+        from_rest=from_rest,
+        largest_step=_largest_step(loop, period_ns, plant, y, _turn(loop, used, start_ns), start_ns),
+        turn=_turn(loop, used, start_ns),
+        notes=loop.notes,
+        hint=loop.hint,
     )
 
 
-def _rows(values: np.ndarray, bag: str) -> np.ndarray:
-    """One row per message, (messages, lanes)."""
-    if values.dtype != object:
+class _Sampling(NamedTuple):
+    """How a stretch's messages come onto its grid.
+
+    Attributes:
+        grid: stamps, (samples,).
+        output: the stretch's outputs; `stamps` their different stamps, `first` the first message of each.
+        hold: between outputs the value before goes on; else there is none.
+    """
+
+    grid: np.ndarray
+    period_ns: int
+    output: Track
+    stamps: np.ndarray
+    first: np.ndarray
+    hold: bool
+
+    def by_stamp(self, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Rows (stamps, lanes) on the grid: those of its stamps, or the nearest and then held; NaN before the first."""
+        grid = self.grid + self.period_ns // 2 if self.hold else self.grid
+        at = np.searchsorted(stamps, grid, side="right") - 1
+        values = rows[np.maximum(at, 0)].astype(np.float64)
+        values[at < 0 if self.hold else (at < 0) | (stamps[np.maximum(at, 0)] != grid)] = np.nan
         return values
-    if len({len(row) for row in values}) > 1:
-        raise AnalysisError(f"{bag}: the number of values changes within an episode: it cannot be analysed")
-    return np.stack(list(values))
+
+    def of_answers(self, track: Track | None, answers: np.ndarray, keys: Sequence[Key]) -> np.ndarray:
+        """Efforts, or the setpoints that they bear, (samples, lanes): by the stamps of the outputs that they answer, or
+        by arrival where they are not stamped so."""
+        if track is None or not answers.size:
+            return np.full((len(self.grid), len(keys)), np.nan)
+        mine = track.only(answers)
+        if np.isin(mine.stamp_ns, self.stamps).mean() < ANSWERS_BY_STAMP:
+            return self.live(mine, keys)[0]
+        stamps, first = np.unique(mine.stamp_ns, return_index=True)
+        table = matched(mine, keys)
+        return self.by_stamp(stamps, (held(table) if self.hold else table)[first])
+
+    def live(self, track: Track | None, keys: Sequence[Key]) -> tuple[np.ndarray, np.ndarray]:
+        """What was received last before each output, (samples, lanes); and, by lane, whether what stands at the first
+        output came within a sample period before it."""
+        if track is None or not len(track):
+            return np.full((len(self.grid), len(keys)), np.nan), np.zeros(len(keys), bool)
+        order = np.argsort(track.receive_ns, kind="stable")
+        times, told = track.receive_ns[order], matched(track, keys)[order]
+        at = np.searchsorted(times, self.output.receive_ns, side="right") - 1
+        rows = np.where((at < 0)[:, None], np.nan, held(told)[np.maximum(at, 0)])
+        came = np.where(np.isnan(told[: at[0] + 1]), np.iinfo(np.int64).min, times[: at[0] + 1, None])
+        latest = came.max(axis=0, initial=np.iinfo(np.int64).min)
+        is_new = latest > self.output.receive_ns[0] - self.period_ns
+        hold = self._replace(hold=True)
+        return hold.by_stamp(self.stamps, rows[self.first]), is_new
 
 
-def _widened(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """One value for all lanes becomes one per lane; what does not fit is not known."""
-    lanes = like.shape[1]
-    if rows.shape[1] == lanes:
-        return rows
-    return np.repeat(rows, lanes, axis=1) if rows.shape[1] == 1 else np.full((len(rows), lanes), np.nan)
+def _used(loop: ObservedLoop, answers: np.ndarray, known: Mapping[str, Configuration]) -> list[Configuration]:
+    """The parameters that efforts were computed with, in order; none if one of them is not known."""
+    if loop.effort is None or not answers.size:
+        return []
+    frames = loop.effort.frame_id[answers]
+    changes = np.flatnonzero(frames[1:] != frames[:-1]) + 1
+    digests = [AnswerLabel.parse(str(frames[i])).parameters for i in (0, *changes)]
+    return [known[digest] for digest in digests] if set(digests) <= known.keys() else []
+
+
+def _turn(loop: ObservedLoop, used: Sequence[Configuration], start_ns: int) -> float:
+    """Of angles, if the controller takes setpoint and output for such."""
+    if not used and loop.controller is not None and loop.controller.at(start_ns).get("angle") is True:
+        return 2 * np.pi
+    return max((configuration.options.turn for configuration in used), default=0.0)
+
+
+def _largest_step(
+    loop: ObservedLoop, period_ns: int, plant: Mapping[str, object], output: np.ndarray, turn: float, start_ns: int
+) -> float | None:
+    """The largest setpoint step of the scenario, or else of the plans that are in the bag."""
+    plans = _scenario_plans(loop.scenario.at(start_ns)) if loop.scenario is not None else {}
+    sampled = []
+    for plan in plans.values() or loop.plans.values():
+        try:
+            sampled.append(plan.sampled(period_ns))
+        except PlanError:
+            continue  # shorter than a sample
+    start = _initial_output(plant, output)
+    sizes = [largest_step(plan.setpoint, start if plan.start is None else plan.start, turn) for plan in sampled]
+    return max(sizes, default=None)
+
+
+def _initial_output(plant: Mapping[str, object], output: np.ndarray) -> float:
+    """Where the plant starts: of its model, or else what was recorded first."""
+    try:
+        return float(make_plant(str(plant["model"]), plant).initial_output)
+    except (KeyError, ValueError):
+        known = output[~np.isnan(output)]
+        return float(known[0]) if known.size else 0.0
 
 
 def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np.ndarray:
@@ -240,34 +412,18 @@ def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np
     return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)
 
 
-def _on_grid(grid: np.ndarray, stamps: np.ndarray, rows: np.ndarray, hold: bool) -> np.ndarray:
-    """Rows by the stamps of the grid; where there is none, NaN, or (hold) the row before."""
-    at = np.searchsorted(stamps, grid, side="right") - 1
-    values = rows[np.maximum(at, 0)].astype(np.float64)
-    values[at < 0 if hold else (at < 0) | (stamps[np.maximum(at, 0)] != grid)] = np.nan
-    return values
-
-
-def _live(signal: Signal | None, field: str, loop: Loop, stretch: slice, grid: np.ndarray) -> np.ndarray:
-    """What was published on a topic last before each output, (samples,); 0 before the first."""
-    if signal is None or not len(signal):
-        return np.zeros(len(grid))
-    values = np.array([row[0] if len(row) else 0.0 for row in getattr(signal, field)])
-    at = np.searchsorted(signal.publish_ns, loop.output.publish_ns[stretch], side="right") - 1
-    column = np.where(at < 0, 0.0, values[np.maximum(at, 0)])
-    stamps, first = np.unique(loop.output.stamp_ns[stretch], return_index=True)
-    return _on_grid(grid, stamps, column[first][:, None], hold=True)[:, 0]
-
-
 def _plan_names(scenario: ParameterHistory | None, plans: Mapping[str, Plan]) -> dict[str, str]:
     """What the scenario calls the plans, by digest."""
     names: dict[str, str] = {}
     for _, values in scenario.sets() if scenario is not None else ():
-        if "sample_period" not in values:
-            continue
-        try:
-            for name, lines in read_episodes(values).items():
-                names[parse_plan(lines, sample_period_in_ns(values["sample_period"])).digest] = name
-        except ValueError:
-            continue  # parameters come one by one: not all of them yet
+        names |= {plan.digest: name for name, plan in _scenario_plans(values).items()}
     return {digest: name for digest, name in names.items() if digest in plans}
+
+
+def _scenario_plans(values: Mapping[str, object]) -> dict[str, Plan]:
+    """The plans of a scenario's parameters; none while they come one by one and not all are there."""
+    try:
+        period_ns = sample_period_in_ns(values["sample_period"])
+        return {name: parse_plan(lines, period_ns) for name, lines in read_episodes(values).items()}
+    except (KeyError, ValueError):
+        return {}

@@ -127,8 +127,8 @@ def _possible_outputs(reader: BagReader, bag: str) -> list[Source]:
     possible = driven or joint_states or any_signal or list(others.values())
     if not possible:
         raise AnalysisError(
-            f"{bag}: no output in it that can be told by its name: choose one with --output TOPIC:FIELD; its topics are "
-            f"{told_topics(reader) or 'none'}" + "".join(f"; missing: {line}" for line in reader.missing)
+            f"{bag}: no output in it that can be told by its name: choose one with --output TOPIC:FIELD; its topics "
+            f"are {told_topics(reader) or 'none'}" + "".join(f"; missing: {line}" for line in reader.missing)
         )
     return possible
 
@@ -256,4 +256,3 @@ def _type(reader: BagReader, source: Source) -> str:
 
 def _field(topic: str, field: str) -> FieldPath:
     return FieldPath(topic, "", (Step(field, None),))
-

@@ -27,7 +27,7 @@ def grouped(episodes: Sequence[Named]) -> dict[str, list[Named]]:
 def label(name: str, episode: Episode, lane: int, bag: str) -> str:
     """How a curve is called in a legend; `bag` is empty where there is only one."""
     parts = [episode.controller.replace("_", "-").upper(), name.rpartition(" ")[2]]
-    parts += [f"lane {lane}"] if episode.lanes > 1 else []
+    parts += [episode.joints[lane] or f"lane {lane}"] if episode.lanes > 1 or episode.joints[lane] else []
     return " ".join(part for part in [*parts, bag] if part)
 
 
@@ -60,7 +60,7 @@ def panel(group: str, members: Sequence[Named], bags: Mapping[str, str], legend:
             episode.output[:, lane],
             episode.control_effort[:, lane],
             episode.setpoint[:, lane],
-            episode.disturbance,
+            episode.disturbance[:, lane],
         )
         for name, episode in members
         for lane in range(min(episode.lanes, MOST_LANES))

@@ -91,6 +91,11 @@ class Surroundings:
         """The parameters of the scenario."""
         return self._node_with("episodes")
 
+    @cached_property
+    def controller(self) -> ParameterHistory | None:
+        """The parameters of the controller."""
+        return self._node_with("kp", "anti_windup")
+
     def _node_with(self, *parameters: str) -> ParameterHistory | None:
         names = set(parameters)
         for node, history in self.histories.items():

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.analysis import page, picture
+from tdof_npid_ros.analysis.effort import Deviation, EffortUse, deviation, effort_use
 from tdof_npid_ros.analysis.episodes import Episode, bag_names, episodes_in
-from tdof_npid_ros.analysis.responses import Deviation, EffortUse, Response, deviation, effort_use, responses
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
+from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
 
 LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
 # Column of the table and of the CSV: title, and how a person reads a value.
@@ -23,6 +25,7 @@ COLUMNS = {
     "episode": ("episode", "{}"),
     "controller": ("controller", "{}"),
     "lane": ("lane", "{}"),
+    "joint": ("joint", "{}"),
     "response": ("response to", "{}"),
     "start_s": ("at (s)", "{:g}"),
     "overshoot_percent": ("M_p (%)", "{:.4f}"),
@@ -99,21 +102,21 @@ class Report:
         rows = self.rows()
         shown = [row for row in rows if row["lane"] < LANES_SHOWN]
         names = [name for name in COLUMNS if any(row[name] not in (None, "") for row in shown)]
-        if all(row["lane"] == 0 for row in rows):
+        if all(row["lane"] == 0 or row["joint"] for row in rows):
             names.remove("lane")
         titles = [COLUMNS[name][0] for name in names]
         return [titles, *([_shown(row, name) for name in names] for row in shown)], len(rows) - len(shown)
 
     def notes(self) -> list[str]:
-        """Why numbers are missing, a line for each cause."""
+        """Why numbers are missing, and what was guessed: a line for each cause, with its bag if there are several."""
         causes: dict[str, list[str]] = {}
+        bags = bag_names(report.episode.bag for report in self.episodes)
         for report in self.episodes:
-            name = title(report.episode)
-            for response in report.responses[0]:
-                if response.reason and (response.kind != "tracking" or response.iae is None):
-                    causes.setdefault(f"response to {response.kind}: {response.reason}", []).append(name)
-            if report.deviation.reason and report.episode.plan is not None:
-                causes.setdefault(f"not compared with the simulation: {report.deviation.reason}", []).append(name)
+            episode = report.episode
+            for cause, lane in _causes(report):
+                joint = episode.joints[lane] if lane is not None else None
+                parts = (bags[episode.bag], title(episode), f"({joint})" if joint else "")
+                causes.setdefault(cause, []).append(" ".join(part for part in parts if part))
         found = [f"{', '.join(dict.fromkeys(names))}: {cause}" for cause, names in causes.items()]
         return [*found, *(f"missing: {line}" for line in self.missing)]
 
@@ -153,8 +156,11 @@ class Report:
         page.write(named, self._cells()[0], self.notes(), Path(path))
 
 
-def analyze(paths: Iterable[str | Path]) -> Report:
+def analyze(paths: Iterable[str | Path], chosen: Chosen = NOTHING_CHOSEN) -> Report:
     """Every episode of some bags, measured.
+
+    Args:
+        chosen: topics and fields of the loop; what is not told is guessed, and the guess noted.
 
     Raises:
         AnalysisError: there is no output in a bag.
@@ -164,7 +170,7 @@ def analyze(paths: Iterable[str | Path]) -> Report:
     missing: list[str] = []
     for path in paths:
         with BagReader(path) as reader:
-            episodes += map(_report, episodes_in(reader, path))
+            episodes += map(_report, episodes_in(reader, path, chosen))
             missing += reader.missing
     return Report(tuple(episodes), tuple(missing))
 
@@ -178,10 +184,24 @@ def _report(episode: Episode) -> EpisodeReport:
     lanes = range(episode.lanes)
     return EpisodeReport(
         episode,
-        tuple(tuple(responses(episode, lane)) for lane in lanes),
+        tuple(tuple(responses(episode.lane(lane))) for lane in lanes),
         tuple(effort_use(episode, lane) for lane in lanes),
         deviation(episode),
     )
+
+
+def _causes(report: EpisodeReport) -> Iterator[tuple[str, int | None]]:
+    """Yield what there is to say of an episode, and the lane that it is about."""
+    episode = report.episode
+    for note in episode.notes:
+        yield note, None
+    for lane, found in enumerate(report.responses[:LANES_SHOWN]):
+        for response in found:
+            if response.reason and (response.kind != "tracking" or response.iae is None):
+                hint = f"; {episode.hint}" if response.reason == NO_SETPOINT and episode.hint else ""
+                yield f"response to {response.kind}: {response.reason}{hint}", lane
+    if report.deviation.reason and episode.plan is not None:
+        yield f"not compared with the simulation: {report.deviation.reason}", None
 
 
 def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:
@@ -192,6 +212,7 @@ def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:
             values: dict[str, Any] = dict.fromkeys(COLUMNS)
             values |= {"bag": bag, "episode": title(episode)}
             values |= {"controller": episode.controller, "lane": lane, "response": response.kind}
+            values |= {"joint": episode.joints[lane]}
             values |= {"start_s": response.start_s, "iae": response.iae}
             metrics = asdict(response.metrics) if response.metrics is not None else {}
             values |= {name: value for name, value in metrics.items() if name in COLUMNS}
@@ -220,14 +241,17 @@ def _as_json(report: EpisodeReport, iae_changes: Iterator[float | None]) -> dict
         "gains": [gains.as_dict() for gains in episode.gains],
         "sample_period_s": episode.sample_period_ns / 1e9,
         "samples": len(episode.time),
+        "first_stamp_ns": episode.first_stamp_ns,
         "missing": episode.missing,
         "lanes": [
             {
+                "joint": joint,
                 "responses": [_response_as_json(response, next(iae_changes)) for response in found],
                 "effort": asdict(use),
             }
-            for found, use in zip(report.responses, report.effort, strict=True)
+            for joint, found, use in zip(episode.joints, report.responses, report.effort, strict=True)
         ],
+        "notes": list(episode.notes),
         "deviation": asdict(report.deviation),
     }
 

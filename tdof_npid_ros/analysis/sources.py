@@ -151,12 +151,16 @@ def states(reader: BagReader, role: Role) -> list[Source]:
     return [
         Source(role, FieldPath(topic, "", _steps(FIELDS[info.type][role])), guessed=True)
         for topic, info in sorted(reader.topics.items())
-        if info.type.startswith("control_msgs/") and len(FIELDS.get(info.type, {})) == 3 and info.count and topic not in reader.unreadable
+        if info.type.startswith("control_msgs/")
+        and len(FIELDS.get(info.type, {})) == 3
+        and info.count
+        and topic not in reader.unreadable
     ]
 
 
 def told_topics(reader: BagReader, without: Collection[str] = ()) -> str:
-    """The bag's topics with their types, for messages; empty if there are none but those of `without`."""
+    """The bag's topics that can be read, with their types, for messages; empty if there are none but `without`."""
+    without = {*without, *reader.unreadable}
     told = [f"{topic} ({info.type})" for topic, info in sorted(reader.topics.items()) if topic not in without]
     more = f" and {len(told) - _MOST_TOLD} more" if len(told) > _MOST_TOLD else ""
     return ", ".join(told[:_MOST_TOLD]) + more
@@ -258,9 +262,7 @@ def _from_messages(reader: BagReader, source: Source) -> Track:
     return _track(reader, source, columns, layouts_of(names, values))
 
 
-def _track(
-    reader: BagReader, source: Source, columns: Mapping[str, np.ndarray], layouts: tuple[Layout, ...]
-) -> Track:
+def _track(reader: BagReader, source: Source, columns: Mapping[str, np.ndarray], layouts: tuple[Layout, ...]) -> Track:
     count = len(columns["log_time"])
     return Track(
         str(source.path),

@@ -33,7 +33,8 @@ class Track:
     Attributes:
         source: topic and field, for people.
         stamp_ns: of the headers, (messages,); 0 where there is none.
-        receive_ns: when they were published (where that is not known, logged), ns since the epoch, (messages,): see `on_one_clock`.
+        receive_ns: when they were published (where that is not known, logged), ns since the epoch, (messages,); see
+            `on_one_clock`.
         log_ns: when they were logged, (messages,).
         frame_id: of the headers, (messages,).
         layouts: the values; together of each message with values, once.

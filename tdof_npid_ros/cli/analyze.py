@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.case import load_case
+from tdof_npid_ros.cli.choice import add_choice, choice
 from tdof_npid_ros.output_file import check_outputs
 
 
@@ -19,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="parameter file that names the class of the bag's plant, for the comparison with the simulation",
     )
+    add_choice(parser)
     parser.add_argument("--png", type=Path, metavar="FILE", help="picture of setpoint, output and effort")
     parser.add_argument("--html", type=Path, metavar="FILE", help="one page with interactive plots, for any browser")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="the table, numbers in full")
@@ -29,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs([path for path in (arguments.png, arguments.html, arguments.csv) if path], _files(arguments.bags))
     if arguments.case:
         load_case(arguments.case)  # from now on its class serves a bag whose plant bears its name
-    report = analyze(arguments.bags)
+    report = analyze(arguments.bags, choice(arguments))
     written = []
     if arguments.png:
         report.picture(arguments.png)

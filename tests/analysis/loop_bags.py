@@ -13,7 +13,6 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.options import PLAIN
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -94,17 +93,21 @@ class LoopBag:
 
     def configuration(self, case: Case, gains: Gains) -> None:
         period = {"sample_period": case.sample_period}
-        plant = {**case.plant_values, "model": case.model, "lanes": gains.lanes}
+        plant = {
+            **{name: value for name, value in case.plant_values.items() if value != []},
+            "model": case.model,
+            "lanes": gains.lanes,
+        }
         plant |= {"effort_min": case.effort_limits[0], "effort_max": case.effort_limits[1]}
         self.parameters("plant", {**plant, **period, "mode": "lockstep"})
-        self.parameters("controller", {**gains.as_dict(), **PLAIN.as_dict(), **period})
+        self.parameters("controller", {**gains.as_dict(), **case.options.as_dict(), **period})
         plans = {f"plan.{name}": list(lines) for name, lines in case.episodes.items()}
         self.parameters("scenario", {"episodes": list(case.episodes), **plans, **period})
 
     def episode(self, case: Case, gains: Gains, name: str, number: int, lost: Sequence[int] = ()) -> None:
         """One lockstep episode; outputs and answers of the steps `lost` are missing."""
         plan, run = case.plans[name], case.simulate(name, gains)
-        digest = parameters_digest(gains, case.sample_period_ns)
+        digest = parameters_digest(gains, case.sample_period_ns, case.options)
         frame = f"{plan.digest}/{number}"
         self.write("scenario_plan", TRAJECTORY, plan_message(plan))
         for k in range(len(run.time)):
