@@ -39,6 +39,7 @@ class Episode:
         name: of its plan in the scenario, or the plan's digest, or `recording`.
         number: the plant's count in lockstep, else the count in the bag.
         plan: None in a bag without, and in realtime, where setpoint and disturbance come from their topics.
+        followed: digest of the plan that the scenario played; empty where the bag does not tell.
         sample_period_ns: of the outputs.
         start_ns: when the first output was published, ns since the epoch.
         first_stamp_ns: of the first output.
@@ -63,6 +64,7 @@ class Episode:
     name: str
     number: int
     plan: Plan | None
+    followed: str
     sample_period_ns: int
     start_ns: int
     first_stamp_ns: int
@@ -143,7 +145,7 @@ def _episodes(loop: ObservedLoop) -> Iterator[Episode]:
     for count, stretch in enumerate(_stretches(output), start=1):
         label = _episode_of(output, stretch)
         mine = answers.published_during(output, stretch) if label is None else answers.of_episode(label)
-        view = _View(loop, output.only(np.arange(stretch.start, stretch.stop)), label, mine, driven)
+        view = _View(loop, output.only(np.arange(stretch.start, stretch.stop)), label, mine, driven, count == 1)
         episode = _episode(view, count, known, names)
         if episode is not None:
             yield episode
@@ -157,6 +159,7 @@ class _View(NamedTuple):
         label: the episode that its messages name.
         answers: indices of the efforts that belong to it.
         driven: the joints that have a setpoint or effort; empty: not known.
+        is_first: of the recording.
     """
 
     loop: ObservedLoop
@@ -164,6 +167,7 @@ class _View(NamedTuple):
     label: EpisodeLabel | None
     answers: np.ndarray
     driven: frozenset[Key]
+    is_first: bool
 
 
 class _Answers:
@@ -262,7 +266,8 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
     effort = sampling.of_answers(loop.effort, view.answers, keys)
     start_ns = int(output.receive_ns[0])
     used = _used(loop, view.answers, known)
-    from_rest = int(grid[0]) == 0
+    plant = loop.plant.at(start_ns) if loop.plant is not None else {}
+    from_rest = _is_start(view, int(grid[0]), plant, y)
     begins = np.full(len(keys), from_rest)
     if plan is not None:
         signals = plan.sampled(period_ns)
@@ -276,13 +281,15 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
         setpoint[:, unknown] = live[:, unknown]
         begins[unknown] |= is_new[unknown]
         disturbance = np.nan_to_num(sampling.live(loop.disturbance, keys)[0])  # before the first there is none
-    plant = loop.plant.at(start_ns) if loop.plant is not None else {}
+        if view.label is not None:
+            digest = loop.plan_followed(start_ns)
     return Episode(
         bag=loop.bag,
         namespace=loop.namespace,
         name=names.get(digest, digest) or UNPLANNED,
-        number=label.number if label is not None and digest else count,
+        number=view.label.number if view.label is not None and plan is not None else count,
         plan=plan,
+        followed=digest,
         sample_period_ns=period_ns,
         start_ns=start_ns,
         first_stamp_ns=int(grid[0]),
@@ -303,6 +310,14 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
         notes=loop.notes,
         hint=loop.hint,
     )
+
+
+def _is_start(view: _View, first_stamp_ns: int, plant: Mapping[str, object], output: np.ndarray) -> bool:
+    """Whether the loop starts with the stretch's first output: at time 0, or where the plant's label says so."""
+    if view.label is None or view.label.plan:
+        return first_stamp_ns == 0
+    # Of a recording that begins within an episode, the first output is not the plant's initial one.
+    return not view.is_first or bool((output[0] == _initial_output(plant, output)).all())
 
 
 class _Sampling(NamedTuple):

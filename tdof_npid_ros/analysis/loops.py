@@ -205,6 +205,7 @@ def _observed(reader: BagReader, surroundings: Surroundings, roles: _Roles) -> I
             surroundings.bag,
             surroundings.namespace,
             surroundings.plans,
+            surroundings.plan_times,
             surroundings.histories,
             output,
             setpoint,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.scenario import Plan, PlanError
 from tdof_npid_ros.wire import JOINT_STATE, SECOND
 
+PLAN_AFTER_RESET_NS = 1_000_000_000  # in realtime the scenario says the plan once it has reset the plant
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 _OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
 _FIELDS = ("header.stamp", "header.frame_id", "name", "position", "velocity", "effort")
@@ -62,12 +63,14 @@ class Surroundings:
         bag: its path, for messages.
         namespace: of plant, controller and scenario; ends with a slash.
         plans: by digest.
+        plan_times: when plans were published, ns since the epoch, with their digests, in order.
         histories: the parameters of every node in the bag, by its full name.
     """
 
     bag: str
     namespace: str
     plans: Mapping[str, Plan]
+    plan_times: Sequence[tuple[int, str]]
     histories: Mapping[str, ParameterHistory]
 
     @classmethod
@@ -79,7 +82,15 @@ class Surroundings:
         Raises:
             BagError: the bag is damaged.
         """
-        return cls(bag, namespace, _plans(reader, f"{namespace}scenario_plan"), histories)
+        return cls(bag, namespace, *_plans(reader, f"{namespace}scenario_plan"), histories)
+
+    def plan_followed(self, start_ns: int) -> str:
+        """The digest of the plan that the scenario plays in an episode of a realtime loop; empty: none is known.
+
+        It is published just after the plant has been reset.
+        """
+        before = [digest for time_ns, digest in self.plan_times if time_ns <= start_ns + PLAN_AFTER_RESET_NS]
+        return before[-1] if before else ""
 
     @cached_property
     def plant(self) -> ParameterHistory | None:
@@ -132,7 +143,7 @@ def read_loops(reader: BagReader, bag: str) -> list[Loop]:
         Loop(
             bag,
             namespace,
-            _plans(reader, f"{namespace}scenario_plan"),
+            *_plans(reader, f"{namespace}scenario_plan"),
             histories,
             topic,
             _signal(reader, topic),
@@ -178,21 +189,23 @@ def _signal(reader: BagReader, topic: str) -> Signal:
     )
 
 
-def _plans(reader: BagReader, topic: str) -> dict[str, Plan]:
-    """The valid plans on a topic by digest; a message that is no plan is one that every node refused."""
+def _plans(reader: BagReader, topic: str) -> tuple[dict[str, Plan], list[tuple[int, str]]]:
+    """The valid plans on a topic by digest, and when each was published; a message that is no plan is one that every
+    node refused."""
     plans: dict[str, Plan] = {}
+    times: list[tuple[int, str]] = []
     if topic not in reader.topics or reader.topics[topic].type != JOINT_TRAJECTORY:
-        return plans
-    for _, _, _, data in reader.messages([topic]):
-        message = reader.decode(topic, data)
-        times = [point["time_from_start"] for point in message["points"]]
+        return plans, times
+    for _, publish_ns, message in reader.decoded(topic):
+        points = [point["time_from_start"] for point in message["points"]]
         try:
             plan = Plan(
                 tuple(message["joint_names"]),
-                tuple(time["sec"] * SECOND + time["nanosec"] for time in times),
+                tuple(time["sec"] * SECOND + time["nanosec"] for time in points),
                 tuple(tuple(point["positions"].tolist()) for point in message["points"]),
             )
         except PlanError:
             continue
         plans[plan.digest] = plan
-    return plans
+        times.append((publish_ns, plan.digest))
+    return plans, times
