@@ -6,7 +6,8 @@ import pytest
 from loop_bags import LoopBag
 
 from tdof_npid_ros.analysis.report import analyze
-from tdof_npid_ros.case import Case, config_folder, load_case
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.parameter_file import config_folder
 
 SHIPPED = sorted(path.stem for path in config_folder().glob("*.yaml"))
 TANKS = """
