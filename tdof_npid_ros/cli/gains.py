@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from tdof_npid_ros.case import Case
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, Gains, controller_type, gains_from_mapping
+from tdof_npid_ros.control.gains import (
+    CONTROLLER_TYPES,
+    PER_LANE,
+    Gains,
+    GainsError,
+    controller_type,
+    gains_from_mapping,
+)
 from tdof_npid_ros.paper.tables import published
 from tdof_npid_ros.paper.tuned import tuned
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
@@ -53,9 +60,7 @@ def gains_by_source(case: Case, kind: str | None, source: str | None) -> Gains:
     if row is None and source is None:
         return case.gains.with_values(type=type_)
     if row is None:
-        raise ParameterFileError(
-            f"there are no {source} gains for {type_} on {case.name}: give --gains FILE, or --kp …"
-        )
+        raise GainsError(f"there are no {source} gains for {type_} on {case.name}: give --gains FILE, or --kp …")
     return case.gains.with_values(type=type_, **{name: getattr(row.gains, name) for name in PER_LANE})
 
 
