@@ -22,6 +22,7 @@ SUBCOMMANDS = {
     "tune": "find the gains of a case with the hybrid genetic algorithm",
     "pareto": "the trade-off between tracking and rejection (the paper's Figure 6)",
     "reproduce": "every table and figure of the paper, published beside ours",
+    "identify": "a plant's model from a recording, with what the recording cannot tell",
     "analyze": "metrics and pictures of the episodes in bags",
     "verify": "recompute every control effort of a bag and compare bit for bit",
     "recover": "rewrite a damaged or unfinished bag whole",
