@@ -19,6 +19,7 @@ SUBCOMMANDS = {
     "demo": "run the paper's first process over ROS 2, end to end",
     "simulate": "run a case in process and print its metrics",
     "margins": "how far a loop is from instability: M_s, gain, phase and delay margin, slowest mode",
+    "certify": "whether a loop is proved to come to rest from every state, and what is not claimed",
     "tune": "find the gains of a case with the hybrid genetic algorithm",
     "pareto": "the trade-off between tracking and rejection (the paper's Figure 6)",
     "reproduce": "every table and figure of the paper, published beside ours",

@@ -95,7 +95,19 @@ def spectral_radius(loop: Loop) -> float:
 
 
 def open_loop(loop: Loop, omega: np.ndarray) -> np.ndarray:
-    """L(e^jω) from the plant's matrices, ω in rad per sample."""
+    """L(e^jω), ω in rad per sample."""
+    response, pd, integral = responses(loop, omega)
+    return np.asarray(response * (pd + integral))
+
+
+def re_g(loop: Loop, omega: np.ndarray) -> np.ndarray:
+    """Re G(e^jω), as the integral action sees the rest of the loop, ω in rad per sample."""
+    response, pd, integral = responses(loop, omega)
+    return np.asarray(integral * response / (1 + response * pd)).real
+
+
+def responses(loop: Loop, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """P from the plant's matrices, C_pd, and h K_i/(z - 1)."""
     plant = loop.sampled
     c = coefficients(loop.gains, loop.period)[:, 0]
     z = np.exp(1j * omega)
@@ -106,7 +118,7 @@ def open_loop(loop: Loop, omega: np.ndarray) -> np.ndarray:
         z ** -float(plant.delay + 1), plant.gamma_old
     )
     x = np.linalg.solve(w[:, None, None] * np.eye(order) - phi, gamma[:, :, None])[:, 0, 0]
-    controller = c[KP] + c[KI_H] / w
+    pd = np.full_like(w, c[KP])
     if loop.gains.kd != 0:
-        controller = controller + c[KD_H] * w / (w + 1 - c[PHI])
-    return np.asarray(x * controller)
+        pd = pd + c[KD_H] * w / (w + 1 - c[PHI])
+    return x, pd, c[KI_H] / w
