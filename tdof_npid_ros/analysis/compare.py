@@ -11,6 +11,7 @@ import numpy as np
 from tdof_npid_ros.analysis.recording import Loop, read_loops
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel, SignalReader
 
 Key = tuple[EpisodeLabel | None, int]  # episode and stamp in ns
@@ -38,7 +39,7 @@ class Recorded:
             BagError: there are none, or several controllers', or the bag is damaged.
         """
         loops = [loop for loop in read_loops(reader, bag) if loop.control_effort is not None]
-        recorder_namespace = reader.custom_data.get("namespace", "/").rstrip("/") + "/"
+        recorder_namespace = in_namespace(reader.custom_data.get("namespace", "/"))
         loops = [loop for loop in loops if loop.namespace == recorder_namespace] or loops
         if not loops:
             raise BagError(f"{bag}: no control efforts in it to compare with: replay it without compare")

@@ -17,7 +17,6 @@ from tdof_npid_ros.analysis.sources import (
     announced,
     candidates,
     leaf_of,
-    namespace_of,
     read_track,
     resolved,
     states,
@@ -26,6 +25,7 @@ from tdof_npid_ros.analysis.sources import (
 from tdof_npid_ros.analysis.tracks import Track, by_place, on_one_clock
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.field_path import FieldPath, Step
+from tdof_npid_ros.names import namespace_of
 from tdof_npid_ros.wire import JOINT_STATE
 
 OUTPUT, SETPOINT, EFFORT, DISTURBANCE = "output", "setpoint", "control_effort", "disturbance"  # as our nodes call them

@@ -12,6 +12,7 @@ from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
 from tdof_npid_ros.bag.columns import SEQUENCE
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.names import namespace_of
 from tdof_npid_ros.scenario import Plan, PlanError
 from tdof_npid_ros.wire import JOINT_STATE, SECOND
 
@@ -110,8 +111,7 @@ class Surroundings:
     def _node_with(self, *parameters: str) -> ParameterHistory | None:
         names = set(parameters)
         for node, history in self.histories.items():
-            its_namespace = node.rpartition("/")[0] + "/"
-            if its_namespace == self.namespace and names <= {name for _, set_ in history.events for name in set_}:
+            if namespace_of(node) == self.namespace and names <= {name for _, set_ in history.events for name in set_}:
                 return history
         return None
 
@@ -150,7 +150,7 @@ def read_loops(reader: BagReader, bag: str) -> list[Loop]:
             _signal_if_there(reader, f"{namespace}control_effort"),
         )
         for topic in _output_topics(reader, bag)
-        for namespace in [topic.rpartition("/")[0] + "/"]
+        for namespace in [namespace_of(topic)]
     ]
 
 

@@ -12,6 +12,7 @@ from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.tracks import Layout, Track, layouts_of
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.field_path import FieldPath, FieldPathError, Selection, Step
+from tdof_npid_ros.names import namespace_of
 from tdof_npid_ros.wire import JOINT_STATE, SECOND
 
 Role = Literal["output", "setpoint", "effort"]
@@ -100,11 +101,6 @@ class Source:
     def namespace(self) -> str:
         """Of the topic; ends with a slash."""
         return namespace_of(self.topic)
-
-
-def namespace_of(topic: str) -> str:
-    """The namespace of a topic; ends with a slash."""
-    return topic.rpartition("/")[0] + "/"
 
 
 def leaf_of(topic: str) -> str:

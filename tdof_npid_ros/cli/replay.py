@@ -7,6 +7,7 @@ import json
 import re
 
 from tdof_npid_ros.graph.replay_node import replay
+from tdof_npid_ros.names import in_namespace
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Replay to the end, or to Ctrl-C."""
     parameters = {name: getattr(arguments, name) for name in ("bag", "rate", "start", "loop", "clock", "compare")}
-    namespace = "/" + arguments.namespace.strip("/")
+    namespace = in_namespace(arguments.namespace).rstrip("/") or "/"
     if not re.fullmatch(r"/|(/[A-Za-z_]\w*)+", namespace, re.ASCII):
         raise ValueError(
             f"--namespace {arguments.namespace!r}: it must be names of letters, digits and _ between slashes"

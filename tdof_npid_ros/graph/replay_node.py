@@ -22,6 +22,7 @@ from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, run_node
 from tdof_npid_ros.interfaces import message_class
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import REPLAY
 from tdof_npid_ros.wire import SECOND, AnswerLabel, Sample
@@ -88,7 +89,7 @@ class ReplayNode(LoopNode):
 
     def _relative(self, topic: str) -> str:
         """A topic's name in the recorded loop's namespace."""
-        return topic.removeprefix(self.namespace.rstrip("/") + "/")
+        return topic.removeprefix(in_namespace(self.namespace))
 
     def _publisher(self, topic: str) -> Publisher | None:
         qos = LATCHED_QOS if self._is_latched(topic) else SIGNAL_QOS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tdof_npid_ros.paper.evaluation import CASE_TITLES, CONTROLLER_TITLES, Row, Rows, deviation_percent
+from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES, Row, Rows, deviation_percent
 from tdof_npid_ros.paper.report import Cell, Table
-from tdof_npid_ros.paper.tables import COMPARED
+from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED
 from tdof_npid_ros.tuning.pareto import Front, dominated_fraction
 
 # How near a row must come to count as reproduced: percentage points for M_p, per cent for the others.

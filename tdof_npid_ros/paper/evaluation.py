@@ -12,15 +12,6 @@ from tdof_npid_ros.paper.tables import Published
 from tdof_npid_ros.tuning.problem import GENERATIONS
 from tdof_npid_ros.tuning.study import tune_case
 
-CASE_TITLES = {
-    "p1-c0.5": "Process 1, c = 0.5",
-    "p1-c4": "Process 1, c = 4",
-    "p2-c2": "Process 2, c = 2",
-    "p2-c5": "Process 2, c = 5",
-    "p3-c1": "Process 3, c = 1",
-    "p3-c2": "Process 3, c = 2",
-    "sprott": "Sprott circuit",
-}
 CONTROLLER_TITLES = {"pid": "PID", "npid": "NPID", "tdof_npid1": "TDOF-NPID1", "tdof_npid2": "TDOF-NPID2"}
 METRICS = {
     "overshoot_percent": "M_p (%)",

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Canvas
 
 from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES
 from tdof_npid_ros.plotting import GUIDE, PALETTE, new_figure
 from tdof_npid_ros.tuning.pareto import Front
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
 
 STYLE: dict[str, dict[str, Any]] = {
     "pid": {"color": PALETTE[0], "linestyle": "-", "marker": "o"},

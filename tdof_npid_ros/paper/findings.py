@@ -12,7 +12,6 @@ from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import TUNED, Gains
 from tdof_npid_ros.paper.conclusions import TOLERANCES, beats_pid
 from tdof_npid_ros.paper.evaluation import (
-    CASE_TITLES,
     CONTROLLER_TITLES,
     Measured,
     Rows,
@@ -33,7 +32,7 @@ from tdof_npid_ros.paper.inferred import (
 )
 from tdof_npid_ros.paper.items import CHANGE_AT, GAIN_TITLES, SETTLED_AT, time_to_fraction_of_peak, variation_metrics
 from tdof_npid_ros.paper.report import Cell, Finding, Table
-from tdof_npid_ros.paper.tables import ROWS, VARIATIONS, Published
+from tdof_npid_ros.paper.tables import CASE_TITLES, ROWS, VARIATIONS, Published
 
 LINEAR = 1e6  # σ so large that k(e) = 1
 PADE_ORDER = 3

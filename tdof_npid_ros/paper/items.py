@@ -12,7 +12,6 @@ from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.paper import figures
 from tdof_npid_ros.paper.evaluation import (
-    CASE_TITLES,
     CONTROLLER_TITLES,
     METRICS,
     Measured,
@@ -23,7 +22,7 @@ from tdof_npid_ros.paper.evaluation import (
 )
 from tdof_npid_ros.paper.figures import Curve, Panel
 from tdof_npid_ros.paper.report import Cell, Figure, Table
-from tdof_npid_ros.paper.tables import COMPARED, VARIATIONS
+from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, VARIATIONS
 from tdof_npid_ros.tuning.pareto import Front
 
 CHANGE_AT = 5.0  # s: when `a` changes (Table 9, Figures 15 and 16)

@@ -23,13 +23,13 @@ from tdof_npid_ros.paper.conclusions import (
     front_statements,
     reproduced,
 )
-from tdof_npid_ros.paper.evaluation import CASE_TITLES, CONTROLLER_TITLES, Measured, Rows, evaluate_row
+from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES, Measured, Rows, evaluate_row
 from tdof_npid_ros.paper.findings import findings
 from tdof_npid_ros.paper.items import ITEMS, Evaluated
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
 from tdof_npid_ros.paper.report import Figure, Finding, Table
-from tdof_npid_ros.paper.tables import COMPARED, ROWS
+from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, ROWS
 from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
 from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front
 from tdof_npid_ros.tuning.problem import GENERATIONS

@@ -6,7 +6,16 @@ from typing import NamedTuple
 
 from tdof_npid_ros.control.gains import ControllerType, Gains
 
-CASES = ("p1-c0.5", "p1-c4", "p2-c2", "p2-c5", "p3-c1", "p3-c2", "sprott")
+CASE_TITLES = {
+    "p1-c0.5": "Process 1, c = 0.5",
+    "p1-c4": "Process 1, c = 4",
+    "p2-c2": "Process 2, c = 2",
+    "p2-c5": "Process 2, c = 5",
+    "p3-c1": "Process 3, c = 1",
+    "p3-c2": "Process 3, c = 2",
+    "sprott": "Sprott circuit",
+}
+CASES = tuple(CASE_TITLES)
 COMPARED: tuple[ControllerType, ...] = ("pid", "tdof_npid1", "tdof_npid2")
 SIGMA = 1.0  # "the biggest change in the setpoint value between steps": a unit step everywhere
 

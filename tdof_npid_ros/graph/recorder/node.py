@@ -32,6 +32,7 @@ from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, run_node
 from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
 from tdof_npid_ros.interfaces import message_class
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import RECORDER
 from tdof_npid_ros.wire import JOINT_STATE
@@ -162,7 +163,7 @@ class RecorderNode(LoopNode):
                 self._follow(topic, types)
 
     def _wanted(self, topic: str) -> bool:
-        namespace = self.get_namespace().rstrip("/") + "/"
+        namespace = in_namespace(self.get_namespace())
 
         def among(patterns: list[str]) -> bool:
             return any(fnmatchcase(topic, p if p.startswith("/") else namespace + p) for p in patterns if p)

@@ -10,6 +10,8 @@ from rcl_interfaces.msg import Parameter, ParameterEvent
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 
+from tdof_npid_ros.names import in_namespace
+
 
 class ParameterSnapshots:
     """Asks each node of a namespace for all its parameters and hands them over as a `ParameterEvent`.
@@ -26,8 +28,8 @@ class ParameterSnapshots:
 
     def look(self) -> None:
         """Ask the nodes that have appeared since the last look, also those that come back."""
-        namespace = self._node.get_namespace().rstrip("/") + "/"
-        present = {f"{its.rstrip('/')}/{name}" for name, its in self._node.get_node_names_and_namespaces()}
+        namespace = in_namespace(self._node.get_namespace())
+        present = {in_namespace(its, name) for name, its in self._node.get_node_names_and_namespaces()}
         for gone in self._asked.keys() - present:
             self._forget(gone)
         for full_name in present - self._asked.keys():

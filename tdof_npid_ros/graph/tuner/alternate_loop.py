@@ -16,6 +16,7 @@ from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
@@ -53,7 +54,6 @@ class AlternateLoop:
         answer_timeout: float,
         check: Callable[[], None],
     ) -> None:
-        base = namespace.rstrip("/")
         self._node = node
         self._problem = problem
         self._test = test
@@ -61,7 +61,7 @@ class AlternateLoop:
         self._loop_timeout = loop_timeout
         self._answer_timeout = answer_timeout
         self._check = check
-        self._controller = RemoteNode(node, f"{base}/controller", answer_timeout, check)
+        self._controller = RemoteNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
         self._good: Gains | None = None
         self._best = float("inf")
         self._level = test.levels[0]
@@ -70,11 +70,13 @@ class AlternateLoop:
         self._watching: Settling | Trial | None = None
         self._outputs = 0
         self._ended = threading.Event()
-        self._setpoint_publisher = node.create_publisher(JointState, f"{base}/setpoint", SIGNAL_QOS)
+        self._setpoint_publisher = node.create_publisher(JointState, in_namespace(namespace, "setpoint"), SIGNAL_QOS)
         self._state_subscription = node.create_subscription(
-            JointState, f"{base}/controller_state", self._on_controller_state, SIGNAL_QOS
+            JointState, in_namespace(namespace, "controller_state"), self._on_controller_state, SIGNAL_QOS
         )
-        self._output_subscription = node.create_subscription(JointState, f"{base}/output", self._on_output, SIGNAL_QOS)
+        self._output_subscription = node.create_subscription(
+            JointState, in_namespace(namespace, "output"), self._on_output, SIGNAL_QOS
+        )
 
     @property
     def in_use(self) -> list[str]:

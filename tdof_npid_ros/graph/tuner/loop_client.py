@@ -19,6 +19,7 @@ from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
 from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
 from tdof_npid_ros.loop import Integrals
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -55,15 +56,18 @@ class LoopClient:
         self._problem = problem
         self._answer_timeout = answer_timeout
         self._check = check
-        base = namespace.rstrip("/")
-        self.plant = RemoteNode(node, f"{base}/plant", answer_timeout, check)
-        self.controller = RemoteNode(node, f"{base}/controller", answer_timeout, check)
+        self.plant = RemoteNode(node, in_namespace(namespace, "plant"), answer_timeout, check)
+        self.controller = RemoteNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
         self._outputs: EpisodeOutputs | None = None
         self._moved = threading.Condition()  # an episode has begun, or ended
         self._episode: EpisodeLabel | None = None  # the latest that the plant has told of
-        self._plan_publisher = node.create_publisher(JointTrajectory, f"{base}/scenario_plan", LATCHED_QOS)
-        self._episodes = node.create_subscription(KeyValue, f"{base}/episode", self._on_episode, LATCHED_QOS)
-        self._tap = Tap(node, f"{base}/output", JOINT_STATE, OUTPUT_QOS)
+        self._plan_publisher = node.create_publisher(
+            JointTrajectory, in_namespace(namespace, "scenario_plan"), LATCHED_QOS
+        )
+        self._episodes = node.create_subscription(
+            KeyValue, in_namespace(namespace, "episode"), self._on_episode, LATCHED_QOS
+        )
+        self._tap = Tap(node, in_namespace(namespace, "output"), JOINT_STATE, OUTPUT_QOS)
         self._reader = SignalReader()
         self._taps = TapThread(self._tap.take, self._on_outputs)
 

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.graph.tuner.loop_client import LoopClient, WrongCaseError
+from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.live import LoopLostError, measure
@@ -110,7 +111,7 @@ class LoopPool:
     # Which loops
 
     def _add(self, namespace: str) -> None:
-        name = f"/{namespace.strip('/')}"
+        name = in_namespace(namespace).rstrip("/") or "/"
         client = LoopClient(self._node, name, self._problem, self._answer_timeout, self._check)
         self._loops[name] = _Loop(client)
 
@@ -144,7 +145,7 @@ class LoopPool:
 
     def _is_heard(self, namespace: str) -> bool:
         """Whether plant and controller have been heard since the loop was lost."""
-        names = [f"{namespace.rstrip('/')}/{node}" for node in ("plant", "controller")]
+        names = [in_namespace(namespace, node) for node in ("plant", "controller")]
         return all(self._heard.get(name, -math.inf) > self._loops[namespace].out_since for name in names)
 
     def _join(self, namespace: str, loop: _Loop) -> None:
