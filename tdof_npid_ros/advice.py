@@ -12,6 +12,7 @@ import numpy as np
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import TUNED
 from tdof_npid_ros.loop import LARGEST_OUTPUT, Trajectory
+from tdof_npid_ros.metrics import RECOVERY_BAND, SETTLING_BAND
 from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.linearise import linearised
 from tdof_npid_ros.plants.ode import Ode
@@ -224,8 +225,8 @@ def _episode(case: Case, name: str, run: Trajectory) -> Iterator[Advice]:
     step = case.largest_step or float(np.ptp(y)) or 1.0
     tail = y[-max(2, len(y) // 20) :] - run.setpoint[-max(2, len(y) // 20) :, None]
     error, moves = float(np.abs(tail).max()), float(np.ptp(tail))
-    moving = ", and moving" if moves > 0.02 * step else ""
-    if not case.options.angle and error > 0.05 * step:
+    moving = ", and moving" if moves > RECOVERY_BAND * step else ""
+    if not case.options.angle and error > SETTLING_BAND * step:
         yield Advice(
             "warning", about,
             f"at its end the output is still {error:.3g} from the setpoint{moving}",

@@ -12,8 +12,8 @@ import numpy as np
 
 SETTLING_BAND = 0.05  # of the setpoint step
 RECOVERY_BAND = 0.02  # of the setpoint step
-CONFIRMED_SHARE = 0.05  # of the response, at its end: it is settled once it has stayed in its band this long
-NO_BAND = "no setpoint step is known that the 2 % band would be a fraction of"
+CONFIRMED_FRACTION = 0.05  # of the response, at its end: it is settled once it has stayed in its band this long
+NO_BAND = f"no setpoint step is known that the {100 * RECOVERY_BAND:g} % band would be a fraction of"
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def disturbance_metrics(
     band = RECOVERY_BAND * abs(setpoint_step)
     recovery, reason = _last_outside(deviation > band, sample_period, "recover", "2")
     if reason is None and recovery == 0.0:
-        reason = f"the deviation never left the 2 % band (±{band:g})"
+        reason = f"the deviation never left the {100 * RECOVERY_BAND:g} % band (±{band:g})"
     return DisturbanceMetrics(float(deviation.max()), recovery, iae, reason)
 
 
@@ -109,7 +109,7 @@ def _last_outside(outside: np.ndarray, period: float, verb: str, band: str) -> t
     last = np.flatnonzero(outside)
     if last.size == 0:
         return 0.0, None
-    if last[-1] >= (1 - CONFIRMED_SHARE) * (outside.size - 1):
+    if last[-1] >= (1 - CONFIRMED_FRACTION) * (outside.size - 1):
         return None, (
             f"does not {verb}: outside the {band} % band {last[-1] * period:g} s after the step, "
             f"too near the response's end ({(outside.size - 1) * period:g} s)"

@@ -15,6 +15,7 @@ from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
 from tdof_npid_ros.draft import Draft, Process, process_of
 from tdof_npid_ros.output_file import OutputError, check_writable
 from tdof_npid_ros.parameter_file import ParameterFileError
+from tdof_npid_ros.parameters import GAINS
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.ode import Ode
 
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     loop.add_argument("--at-effort", type=float, metavar="U", help="the effort there (default: 0)")
     loop.add_argument("--unit", default="", help="of the output, for the comments: K, rad, m")
     loop.add_argument("--sample-period", type=float, metavar="H", help="s (default: chosen)")
-    loop.add_argument("--controller", default="tdof_npid2", metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
+    loop.add_argument("--controller", default=GAINS["type"].default, metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
 
 
 def run(arguments: argparse.Namespace) -> int:

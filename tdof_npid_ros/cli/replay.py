@@ -8,13 +8,17 @@ import re
 
 from tdof_npid_ros.graph.replay_node import replay
 from tdof_npid_ros.names import in_namespace
+from tdof_npid_ros.parameters import REPLAY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("bag", metavar="BAG", help="bag folder, .mcap or .db3 file")
-    parser.add_argument("--rate", type=float, default=1.0, help="times the recorded speed (default 1)")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds of the recording to leave out")
+    parser.add_argument(
+        "--rate", type=float, default=REPLAY["rate"].default, help="times the recorded speed (default 1)"
+    )
+    start = REPLAY["start"].default
+    parser.add_argument("--start", type=float, default=start, metavar="S", help="seconds of the recording to leave out")
     parser.add_argument("--loop", action="store_true", help="begin again at the end")
     parser.add_argument("--clock", action="store_true", help="publish /clock")
     parser.add_argument("--namespace", default="/", help="where to publish (default /)")

@@ -29,6 +29,7 @@ from tdof_npid_ros.cli.simulate import (
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, controller_type
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, find_parameter_file, write_parameters
+from tdof_npid_ros.parameters import TUNER
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
@@ -40,10 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
     parser.add_argument("--controller", required=True, metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
-    parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same result (default: 0)")
+    seed, algorithm = TUNER["seed"].default, TUNER["algorithm"].default
+    parser.add_argument("--seed", type=int, default=seed, help=f"the same seed gives the same result (default: {seed})")
     parser.add_argument("--free", choices=["sigma"], help="tune the width of k(e) too")
     parser.add_argument("--weight", type=float, help="w of IAE_SP + w·IAE_DIS (default: the case's)")
-    parser.add_argument("--algorithm", default="hga", metavar="|".join(ALGORITHMS), help="default: hga")
+    parser.add_argument("--algorithm", default=algorithm, metavar="|".join(ALGORITHMS), help=f"default: {algorithm}")
     parser.add_argument("--population", type=int, default=POPULATION, metavar="N", help=f"default: {POPULATION}")
     length = parser.add_mutually_exclusive_group()
     length.add_argument(

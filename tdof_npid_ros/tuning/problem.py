@@ -66,8 +66,8 @@ class TuningProblem:
     controller: ControllerType
     extra: tuple[str, ...] = ()
     weight: float = WEIGHT.default
-    algorithm: str = "hga"
-    seed: int = 0
+    algorithm: str = TUNER["algorithm"].default
+    seed: int = TUNER["seed"].default
     population: int = POPULATION
     generations: int = GENERATIONS
     polish: int = POLISH
