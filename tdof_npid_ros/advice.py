@@ -11,6 +11,7 @@ import numpy as np
 
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import TUNED
+from tdof_npid_ros.control.session import FAR_IN_SIGMA
 from tdof_npid_ros.loop import LARGEST_OUTPUT, Trajectory
 from tdof_npid_ros.metrics import RECOVERY_BAND, SETTLING_BAND
 from tdof_npid_ros.plants.linear import TransferFunction
@@ -26,7 +27,6 @@ ACCURATE = 0.5  # |λ| times the step up to which its error is below 1e-3 a time
 COARSE, FINE = 10.0, 20_000.0  # samples per closed-loop time that are too few, and more than serve anything
 ODD_EFFORT = (1e-3, 1e3)  # effort that a step takes, as a fraction of the limits' distance, beyond which units differ
 AT_LIMIT = 0.9  # fraction of an episode's samples at a limit that count as throughout
-FAR_FROM_SIGMA = 3.0  # a step of so many σ leaves the integral action dead: exp(-9/2) = 0.011
 
 
 class Advice(NamedTuple):
@@ -127,7 +127,7 @@ def _sigma(case: Case) -> Iterator[Advice]:
         return
     sigma = float(np.min(case.gains.per_lane("sigma")))
     step = case.largest_step
-    if step > FAR_FROM_SIGMA * sigma:
+    if step > FAR_IN_SIGMA * sigma:
         yield Advice(
             "warning", "sigma",
             f"{sigma:g}, but the setpoint moves by {step:g}: such an error is integrated at "

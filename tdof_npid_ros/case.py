@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from tdof_npid_ros.responses import largest_step
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
 Bounds = tuple[float, float]
+SIGMA_BOUNDS = (0.2, 20.0)  # of the tuner's search, as multiples of the setpoint's largest step
 
 
 @dataclass(frozen=True)
@@ -223,11 +224,35 @@ def load_case(name: str | Path) -> Case:
             options=options_from_mapping(controller),
         )
         _ = case.plant, case.plans
+        case = _with_scale(case, "sigma" in controller)
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
     for node, values in nodes.items():
         for warning in misspelt(values, tables[node]):
             warnings.warn(f"{path}: {node}: {warning}", stacklevel=2)
+    return case
+
+
+def _with_scale(case: Case, sigma_given: bool) -> Case:
+    """The case with what follows from its setpoint's largest step: sigma and its bounds, where they are not given.
+
+    The paper: sigma is the largest change of the setpoint.
+
+    Raises:
+        GainsError: the type needs a sigma, and there is neither one nor a step.
+    """
+    step = case.largest_step
+    if step and "sigma" not in case.bounds:
+        case = replace(case, bounds={**case.bounds, "sigma": (SIGMA_BOUNDS[0] * step, SIGMA_BOUNDS[1] * step)})
+    if sigma_given:
+        return case
+    if step:
+        return replace(case, gains=case.gains.with_values(sigma=step))
+    if case.gains.type != "pid" and case.episodes:
+        raise GainsError(
+            "sigma is not given, and the setpoint never steps in the case's episodes: set it to the largest change of "
+            "the setpoint, in the output's unit"
+        )
     return case
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tdof_npid_ros.case import SIGMA_BOUNDS
 from tdof_npid_ros.control.gains import ControllerType
 from tdof_npid_ros.plants.linearise import linearised
 from tdof_npid_ros.plants.ode import Ode, Sprott
@@ -22,7 +23,6 @@ SETTLED = 12.0  # closed-loop times until a step has settled, with room
 SWINGS = 4.0  # as SETTLED, times this, where the rule does not design the closed loop's time
 RECOVERED = 8.0  # integral times until a disturbance has gone, with room
 SPREAD = 20.0  # tuner's bounds: the first gains divided and multiplied by it
-SIGMA_SPREAD = (0.2, 20.0)  # tuner's bounds of sigma, as multiples of the largest step
 DISTURBANCE = 0.1  # of the effort's range, or of the effort that the step takes
 
 
@@ -288,7 +288,7 @@ class Draft:
         lines += [
             "      alpha: [0.0, 1.0]",
             "      beta: [0.0, 1.0]",
-            f"      sigma: {_yaml([significant(factor * sigma) for factor in SIGMA_SPREAD])}",
+            f"      sigma: {_yaml([significant(factor * sigma) for factor in SIGMA_BOUNDS])}",
         ]
         return "\n".join(lines) + "\n"
 

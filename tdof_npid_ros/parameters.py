@@ -149,14 +149,14 @@ GAINS: Final = table(
     Parameter(
         "sigma",
         1.0,
-        "width of the nonlinear gain k(e) (4); a large one makes the law nearly linear; all types but pid",
+        "width of the nonlinear gain k(e) (4): the largest change of the setpoint; all types but pid need it given",
         "the output's unit",
         SIGMA,
         per_lane=True,
     ),
     Parameter("n", 10.0, "derivative filter N (1b); usually 5 to 30", within=ABOVE_0_FINITE),
-    Parameter("effort_min", -math.inf, "lower limit of the effort", "the effort's unit", per_lane=True),
-    Parameter("effort_max", math.inf, "upper limit of the effort", "the effort's unit", per_lane=True),
+    Parameter("effort_min", -math.inf, "lower limit of the effort", "the effort's unit", per_lane=True, of_loop=True),
+    Parameter("effort_max", math.inf, "upper limit of the effort", "the effort's unit", per_lane=True, of_loop=True),
     Parameter("anti_windup", "conditional", "what the integral action does at a limit", choices=ANTI_WINDUP),
     Parameter(
         "tracking_time",
@@ -286,8 +286,8 @@ PLANT: Final = table(
         within=Range(1, 100_000),
         of_loop=True,
     ),
-    Parameter("effort_min", -math.inf, "lower limit of the actuator", "the effort's unit"),
-    Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit"),
+    Parameter("effort_min", -math.inf, "lower limit of the actuator", "the effort's unit", of_loop=True),
+    Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit", of_loop=True),
     Parameter(
         "reply_timeout",
         0.5,

@@ -88,7 +88,7 @@ class Fast:
 '''
 FAST = """
 /**: {ros__parameters: {sample_period: 0.01, mode: lockstep}}
-/**/plant: {ros__parameters: {model: "advised_plants:Fast", substeps: %d}}
+/**/plant: {ros__parameters: {model: "advised_%d:Fast", substeps: %d}}
 /**/controller: {ros__parameters: {type: pid, kp: 2.0, ki: 10.0}}
 /**/scenario:
   ros__parameters:
@@ -101,9 +101,9 @@ FAST = """
 def test_an_integration_that_is_unstable_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, substeps: int, severity: str | None
 ) -> None:
-    (tmp_path / "advised_plants.py").write_text(PLANTS)
+    (tmp_path / f"advised_{substeps}.py").write_text(PLANTS)
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "fast.yaml"
-    path.write_text(FAST % substeps)
+    path.write_text(FAST % (substeps, substeps))
     found = [one for one in advice(load_case(path)) if one.about == "substeps"]
     assert [one.severity for one in found] == ([severity] if severity else [])

@@ -11,7 +11,7 @@ from tdof_npid_ros.advice import advice
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.draft import Process, process_of
-from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.catalog import make_plant, named_model
 from tdof_npid_ros.plants.ode import Ode
 
 KINDS = {
@@ -88,7 +88,7 @@ def test_a_class_of_ones_own_is_linearised_where_it_works(
 ) -> None:
     (tmp_path / "drafted_tank.py").write_text(TANK)
     monkeypatch.syspath_prepend(tmp_path)
-    tank = make_plant("drafted_tank:Tank", {})
+    tank = make_plant(named_model("drafted_tank:Tank", tmp_path), {})
     assert isinstance(tank, Ode)
     process = process_of(tank.at_rest(1.0))
     assert process.time_constants == pytest.approx((10.0,)) and process.gain == pytest.approx(5.0)

@@ -16,7 +16,7 @@ from tdof_npid_ros.draft import Draft, Process, process_of
 from tdof_npid_ros.output_file import OutputError, check_writable
 from tdof_npid_ros.parameter_file import ParameterFileError
 from tdof_npid_ros.parameters import GAINS
-from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.catalog import make_plant, named_model
 from tdof_npid_ros.plants.ode import Ode
 
 
@@ -96,7 +96,7 @@ def _draft(arguments: argparse.Namespace) -> Draft:
     at = 0.0 if arguments.at is None else arguments.at
     rest = 0.0 if arguments.at_effort is None else arguments.at_effort
     if arguments.model is not None:
-        return _of_class(arguments.model, at, common)
+        return _of_class(named_model(arguments.model, arguments.file.parent), at, common)
     process = Process(
         arguments.gain, tuple(arguments.time_constant or ()), arguments.dead_time, integrating=arguments.integrating
     )

@@ -18,6 +18,7 @@ from tdof_npid_ros.wire import NO_VALUES, AnswerLabel, EpisodeLabel, Sample
 
 FAR_NS = 1_000_000_000  # a stamp that far back, or ahead of the time that has passed, is another clock's
 IN_A_ROW = 3  # outputs that do not belong to the loop, but follow each other: the loop has changed over to them
+FAR_IN_SIGMA = 3.0  # k(3 sigma) = 0.011: beyond it the integral action is as good as dead
 REMEMBERED = 100  # activations of plants whose labels are known to be no new ones
 
 Decision = Literal[
@@ -276,6 +277,14 @@ class Session:
     def set_setpoint(self, setpoint: np.ndarray) -> None:
         """Take this setpoint, (1,) or (lanes,), for outputs without a plan."""
         self.setpoint, self.holds_output = setpoint, False
+
+    @property
+    def is_setpoint_far(self) -> bool:
+        """Whether the live setpoint is so far from the latest output that the integral action hardly sees the error."""
+        if not len(self._answered) or self.controller.gains.type == "pid" or not self.is_live:
+            return False
+        error = np.abs(self._live_setpoint() - self._answered)
+        return bool((error > FAR_IN_SIGMA * self.controller.gains.per_lane("sigma")).any())
 
     # In the loop
 

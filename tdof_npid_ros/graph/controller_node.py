@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import sys
 import time
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,12 +16,13 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import Gains, gains_from_mapping
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
-from tdof_npid_ros.control.session import OUT_OF_STEP, Answer, Outcome, Session
+from tdof_npid_ros.control.session import FAR_IN_SIGMA, OUT_OF_STEP, Answer, Outcome, Session
 from tdof_npid_ros.graph.runtime.endpoints import signal_qos
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
@@ -43,6 +47,9 @@ class ControllerNode(LoopEnd):
     def __init__(self) -> None:
         super().__init__("controller")
         given = self.declare_all(CONTROLLER)
+        self.sigma_is_given = "sigma" in self._parameter_overrides
+        if not self.sigma_is_given:
+            _check_sigma(given["type"], _of_files(sys.argv))
         self.quiet_parameters.add("manual_effort")
         self.controller = Controller(
             gains_from_mapping(given), sample_period_in_ns(given["sample_period"]), options_from_mapping(given)
@@ -104,6 +111,12 @@ class ControllerNode(LoopEnd):
             self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
         else:
             self.session.set_setpoint(r)
+            if self.session.is_setpoint_far:
+                self.warn_once(
+                    f"the setpoint is more than {FAR_IN_SIGMA:g} sigma from the output (sigma is "
+                    f"{self.controller.gains.sigma}): such an error is hardly integrated, the output may stop short; "
+                    "set sigma to the largest change of the setpoint"
+                )
 
     def _on_manual_effort(self, sample: Sample) -> None:
         values = self._picked("manual_effort", sample.name, sample.effort)
@@ -183,6 +196,8 @@ class ControllerNode(LoopEnd):
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         gains, _ = self._configured(changes)
+        if not self.sigma_is_given and "sigma" not in changes:
+            _check_sigma(gains.type, "")
         setpoint = np.atleast_1d(changes["setpoint"]) if "setpoint" in changes else self.session.setpoint
         if len(setpoint) not in (1, gains.lanes):
             raise ValueError(
@@ -192,6 +207,7 @@ class ControllerNode(LoopEnd):
 
     def changed(self, changes: dict[str, Any]) -> None:
         """Take over accepted changes."""
+        self.sigma_is_given |= "sigma" in changes
         if changes.keys() & (GAINS.keys() | OPTIONS.keys()):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes:
@@ -240,6 +256,26 @@ class ControllerNode(LoopEnd):
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts
+
+
+def _check_sigma(type_: str, hint: str) -> None:
+    """Refuse a type that needs sigma where none is given: 1 of the output's unit would be a guess."""
+    if type_ != "pid":
+        raise ValueError(
+            f"type {type_} needs sigma, which is not given: set it to the largest change of the setpoint, in the "
+            f"output's unit{hint}; or take type pid"
+        )
+
+
+def _of_files(arguments: Sequence[str]) -> str:
+    """What the parameter files among a node's arguments say of the setpoint's largest change, for a message."""
+    for option, path in pairwise(arguments):
+        if option == "--params-file":
+            with suppress(ValueError), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                if step := load_case(path).largest_step:
+                    return f" (in {path}: {step:g})"
+    return ""
 
 
 def main(args: list[str] | None = None) -> None:

@@ -202,12 +202,15 @@ class Graph:
             namespace: to start it in.
             cwd: folder to start it in.
             program: Python that runs it, in place of ours.
-            parameters: after those of the case; dots in names as double underscores.
+            parameters: after those of the case; dots in names as double underscores; None: left out.
         """
         values = dict(parameters)
         if case:
             path = Path(case) if case.endswith(".yaml") else REPOSITORY / "config" / f"{case}.yaml"
             values = read_parameters(path, node) | values
+        if node == "controller" and values.get("type") != "pid":
+            values.setdefault("sigma", 1.0)  # what the tests' loops have; it must be given
+        values = {name: value for name, value in values.items() if value is not None}
         command = ["--ros-args", *arguments]
         if namespace:
             command += ["-r", f"__ns:={namespace}"]

@@ -284,6 +284,12 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
 
     # Reporting
 
+    def warn_once(self, text: str) -> None:
+        """Log a warning; the same text only once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            self.get_logger().warning(one_line(text))
+
     def refuse(self, count: str, cause: str, detail: str = "") -> None:
         """Count something that was refused; the first time for each cause, log it with its detail."""
         self.counts[count] += 1
