@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import sys
 import tempfile
@@ -38,8 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Tune over ROS 2, then run the published and the tuned gains, recorded, and compare."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     from tdof_npid_ros.analysis.report import analyze, title
+    from tdof_npid_ros.graph.runtime.middleware import stay_on_this_machine
+
+    stay_on_this_machine()
 
     case = load_case(CASE)
     bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -29,7 +29,7 @@ from typing import IO, Any
 
 import pytest
 
-from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.middleware import PROFILE, RANGE, stay_on_this_machine
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
 
 
@@ -132,17 +132,17 @@ class Graph:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.experimental import EventsExecutor
 
-        use_fast_dds_profile()
         self.domain, self._reservation = reserved_domain()
         self.folder = folder
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            RANGE: "LOCALHOST",
             "PYTHONFAULTHANDLER": "1",
             "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]),
         }
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        stay_on_this_machine(self.environment)
+        os.environ.update({name: self.environment[name] for name in (PROFILE, RANGE)})
         self.processes: list[NodeProcess] = []
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=self.domain)

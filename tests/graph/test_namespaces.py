@@ -81,6 +81,7 @@ class Hosts:
             **os.environ,
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+            "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "config" / "fastdds.xml"),  # not that of other tests
             "PYTHONPATH": str(REPOSITORY),
         }
         log = self._folder / f"{len(self._processes)}-{node}.log"
