@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -23,6 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parent
 _SOURCES = (
     "compiled.py",
+    "bag/scan.py",
     "loop.py",
     "control/exponential.py",
     "control/law.py",
@@ -63,7 +66,10 @@ def entry_point(function: F) -> F:
     the inlined code of several files. So each state of those files has a cache folder of its own.
     """
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_cache_root(before) / _sources_digest())
+    folder = _cache_folder(before)
+    if folder is None:
+        return cast(F, numba.njit(error_model="numpy", nogil=True)(function))
+    numba.config.CACHE_DIR = str(folder)
     try:
         return cast(F, numba.njit(error_model="numpy", nogil=True, cache=True)(function))
     finally:
@@ -79,10 +85,23 @@ def uncached(entry: Any) -> Any:
     return numba.njit(error_model="numpy", nogil=True)(entry.py_func)
 
 
-def _cache_root(configured: str) -> Path:
-    if configured:
-        return Path(configured)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tdof_npid_ros"
+@cache
+def _cache_folder(configured: str) -> Path | None:
+    """Where machine code is kept; None where nothing can be.
+
+    Numba would then take another place, beside the sources or in the home, without regard to the other files' state.
+    """
+    try:
+        root = configured or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = (Path(root) if configured else Path(root) / "tdof_npid_ros") / _sources_digest()
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except (OSError, RuntimeError) as error:  # the latter: no home is known
+        warnings.warn(
+            f"machine code cannot be kept ({error}), so each start compiles anew: set NUMBA_CACHE_DIR", stacklevel=2
+        )
+        return None
 
 
 def _sources_digest() -> str:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
+import fcntl
+import hashlib
 import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 ROOM = 65536  # bytes: more than a result or a checkpoint of any population takes
 
@@ -27,6 +31,34 @@ def check_outputs(outputs: Sequence[Path], inputs: Sequence[Path] = ()) -> None:
         taken.add(path.resolve())
     for path in outputs:
         check_writable(path)
+
+
+_held: dict[Path, IO[str]] = {}  # locks of this process
+
+
+def hold(path: Path) -> None:
+    """Make sure that no other process on this machine writes this file or folder before this process has ended.
+
+    The lock is a file among the temporary ones, for the file itself may be replaced again and again.
+
+    Raises:
+        OutputError: another process holds it.
+    """
+    name = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
+    lock = Path(tempfile.gettempdir()) / f"tdof-npid-{os.getuid()}-{name}.lock"
+    if lock in _held:
+        return
+    try:
+        file = lock.open("a", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be locked: {lock}: {error.strerror}") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise OutputError(f"{path} is being written by another run: wait for its end, or give another path") from None
+    _held[lock] = file
+    atexit.register(lock.unlink, missing_ok=True)
 
 
 def check_writable(path: Path) -> None:

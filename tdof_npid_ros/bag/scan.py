@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tdof_npid_ros.compiled import compiled, entry_point
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -23,8 +24,6 @@ WRONG_TIME: Final = 3  # a time beyond 2**63 - 1 ns
 OTHER_RECORD: Final = 4  # no message (only `run_length` stops there)
 TOO_MANY: Final = 5  # records that are no messages
 
-_compiled: Any = njit(cache=True, nogil=True)
-
 
 def _uint64(data: Bytes, at: int) -> np.uint64:
     value = np.uint64(0)
@@ -33,7 +32,7 @@ def _uint64(data: Bytes, at: int) -> np.uint64:
     return value
 
 
-_u64 = _compiled(_uint64)
+_u64: Any = compiled(_uint64)
 
 
 def _walk(data: Bytes, only_messages: bool) -> tuple[int, int, int, int]:
@@ -60,7 +59,7 @@ def _walk(data: Bytes, only_messages: bool) -> tuple[int, int, int, int]:
     return position, messages, others, AT_END
 
 
-_walk_compiled = _compiled(_walk)
+_walk_compiled = entry_point(_walk)
 
 
 def _fill(
@@ -103,7 +102,7 @@ def _fill(
     return -1
 
 
-_fill_compiled = _compiled(_fill)
+_fill_compiled = entry_point(_fill)
 
 
 def _copy_rows(data: Bytes, offset: Ints, size: int, rows: Bytes) -> None:
@@ -118,7 +117,7 @@ def _copy_rows(data: Bytes, offset: Ints, size: int, rows: Bytes) -> None:
             rows[row, index] = 0
 
 
-_copy_rows_compiled = _compiled(_copy_rows)
+_copy_rows_compiled = entry_point(_copy_rows)
 
 
 class Table(NamedTuple):

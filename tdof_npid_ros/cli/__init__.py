@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import sys
 import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
 from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.streams import prepare_streams
 
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {
@@ -50,9 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = _run(given, name)
         sys.stdout.flush()
+        if (failure := getattr(sys.stdout, "failure", None)) is not None:  # after all that was to be done
+            raise failure
         return status
     except BrokenPipeError:  # before OSError, which it is: whoever reads our output has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return READER_GONE
     except (ValueError, OSError, RuntimeError, MemoryError, ArithmeticError) as error:
         print(f"tdof-npid {name}: {_message(error)}", file=sys.stderr)
@@ -91,5 +92,6 @@ def _message(error: Exception) -> str:
 
 def entry() -> None:
     """The console script."""
+    prepare_streams()
     warnings.formatwarning = lambda message, *_, **__: f"tdof-npid: {message}\n"  # in one line, as errors are
     sys.exit(main())

@@ -14,6 +14,7 @@ import sys
 from types import FrameType
 
 from tdof_npid_ros.reference import node_help
+from tdof_npid_ros.streams import prepare_streams
 
 MODULES = {
     "plant": "plant.node",
@@ -27,6 +28,7 @@ MODULES = {
 
 def run(node: str, arguments: list[str]) -> None:
     """Run a node with its command line's arguments, the program's name first."""
+    prepare_streams()
     if {"-h", "--help"} & set(arguments[1:]):
         print(node_help(node))
         return

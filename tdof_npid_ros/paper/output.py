@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tdof_npid_ros.output_file import OutputError
+from tdof_npid_ros.output_file import OutputError, hold
 
 MARKER = ".tdof-npid"
 
@@ -13,7 +13,8 @@ def claim_folder(folder: Path, subcommand: str) -> Path:
     """Make the folder and mark it as the output of a subcommand, so that a later run may write it again.
 
     Raises:
-        OutputError: there is something in the folder that this subcommand did not write, or it cannot be written.
+        OutputError: there is something in the folder that this subcommand did not write, it cannot be written, or
+            another run writes it now.
     """
     marker = folder / MARKER
     try:
@@ -22,6 +23,7 @@ def claim_folder(folder: Path, subcommand: str) -> Path:
         if folder.is_dir() and any(folder.iterdir()) and _written_by(marker) != subcommand:
             raise OutputError(f"{folder} holds files that '{subcommand}' did not write: give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
+        hold(folder)
         marker.write_text(f"{subcommand}\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from error

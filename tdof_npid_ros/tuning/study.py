@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import ControllerType, Gains
+from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.output_file import hold
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores
 from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
@@ -66,6 +68,7 @@ class Study:
         Raises:
             TuningError: the problem cannot be searched; the checkpoint is of another problem, damaged or of a newer
                 version; or it is there but not to be resumed. Nothing is overwritten.
+            OutputError: another run writes the checkpoint.
         """
         self.problem = problem
         self._checkpoint = checkpoint
@@ -73,6 +76,7 @@ class Study:
         self._optimizer = self._new_optimizer()
         if checkpoint is None:
             return
+        hold(checkpoint)
         if not checkpoint.exists():
             self._save()
         elif resume:
@@ -186,8 +190,10 @@ class Study:
         try:
             self._improvements = [Improvement(*one) for one in content["improvements"]]
             self._optimizer = restore_optimizer(content["optimizer"])
-        except (KeyError, TypeError, TuningError) as error:
-            raise TuningError(f"checkpoint {path} is damaged, start anew with another file: {error}") from None
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, TuningError) as error:
+            raise TuningError(
+                f"checkpoint {path} is damaged, start anew with another file: {one_line(error)}"
+            ) from None
 
 
 def _difference(there: Any, here: dict[str, Any]) -> str:
