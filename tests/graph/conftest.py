@@ -335,6 +335,10 @@ class Graph:
 
         return self.wait_until(answered, timeout, f"an answer of {service}").result()
 
+    def client(self, service: str) -> Any:
+        """The client of a service that was called before."""
+        return self._clients[service]
+
     def set_parameters(self, node: str, atomically: bool = False, **values: Any) -> list[Any]:
         """Set parameters of a node; returns the results (`successful`, `reason`), one for all if atomically."""
         from rcl_interfaces.srv import SetParameters, SetParametersAtomically
