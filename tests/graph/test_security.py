@@ -82,7 +82,9 @@ def test_a_policy_allows_what_its_node_has_and_nothing_else(graph: Any, node: st
     expected = {action: allowed(node, kind, action) for action, kind in kinds.items()}
     if node == "replay":  # a bag may hold anything of a loop
         assert expected["publish"] >= {f"/{name.lstrip('/')}" for name in {*EXPECTED, *RECORDED}}
-        expected["publish"] -= {f"/{name}" for name in ("setpoint", "disturbance", *RECORDED - {"control_effort"})}
+        expected["publish"] -= {
+            f"/{name}" for name in ("setpoint", "disturbance", "episode", *RECORDED - {"control_effort"})
+        }
     seen: dict[str, set[str]] = {action: set() for action in kinds}
 
     graph.wait_for_nodes(*(f"{namespace}/{node}" for namespace in ways))
