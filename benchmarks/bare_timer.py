@@ -15,7 +15,7 @@ def run(period: float, seconds: float) -> None:
     import rclpy
     from rclpy.clock import Clock, ClockType
 
-    from tdof_npid_ros.graph.runtime.node import fastest_executor
+    from tdof_npid_ros.graph.runtime.run import fastest_executor
 
     rclpy.init()
     node = rclpy.create_node("bare_timer")

@@ -121,7 +121,7 @@ class IdlePlant:
 
     def _change(self, transition: int) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        if not self._conductor.call(ChangeState, "plant/change_state", request).success:
+        if not self._conductor.remote("plant").call(ChangeState, "change_state", request).success:
             raise RuntimeError(f"the plant refused transition {transition}")
 
 

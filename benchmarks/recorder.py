@@ -33,7 +33,7 @@ VARIANTS: dict[str, dict[str, Any] | None] = {
 
 
 def run(size: str) -> Result:
-    """The variants in turn, so that all see the same machine; each bag is verified (E2) and compared (E1)."""
+    """The variants in turn, so that all see the same machine; each bag is verified, and compared with the loop here."""
     from tdof_npid_ros.analysis.report import analyze
     from tdof_npid_ros.analysis.verify import verify
     from tdof_npid_ros.bag.reader import BagReader
@@ -104,18 +104,13 @@ def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None, lanes: 
         for node in ("plant", "controller", "scenario"):
             nodes.start(node, recording)
         conductor = Conductor(NAMESPACE, nodes.check)
-
-        def has_run(episodes: int) -> bool:
-            begun, state = conductor.fact("plant", "episode"), conductor.fact("plant", "state")
-            return int(begun or 0) >= episodes + (state != "finished")
-
         try:
             watched = {"output": 1 + recorded, "control_effort": 1 + recorded, "scenario_plan": 2 + recorded}
             conductor.wait_for_subscriptions(watched, TIMEOUT)
-            conductor.trigger("scenario/play")
-            conductor.wait(lambda: has_run(1), "the first episode's end", TIMEOUT)
+            conductor.play(TIMEOUT)
+            conductor.wait(lambda: conductor.episodes_finished >= 1, "the first episode's end", TIMEOUT)
             start = time.monotonic()
-            conductor.wait(lambda: has_run(2), "the episode's end", TIMEOUT)
+            conductor.wait(lambda: conductor.episodes_finished >= 2, "the episode's end", TIMEOUT)
             return steps / (time.monotonic() - start)
         finally:
             conductor.close()

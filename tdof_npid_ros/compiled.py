@@ -2,7 +2,7 @@
 
 No fast-math: a sum keeps its order and no multiply-add is fused but where it is written out, so a function gives the
 same bits wherever it is
-inlined and however many lanes are vectorised. That is what the equalities E1-E4 stand on.
+inlined and however many lanes are vectorised. That is what the four equalities (docs/architecture.md) stand on.
 """
 
 from __future__ import annotations

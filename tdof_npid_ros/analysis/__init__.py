@@ -1,4 +1,4 @@
-"""What bags tell: episodes, metrics, comparison with the in-process simulation, and E2. Knows files, no ROS."""
+"""What bags tell: episodes, metrics, comparison with the in-process simulation, verification. Knows files, no ROS."""
 
 from tdof_npid_ros.analysis.errors import AnalysisError
 

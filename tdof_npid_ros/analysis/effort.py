@@ -31,7 +31,8 @@ class EffortUse:
 
 @dataclass(frozen=True)
 class Deviation:
-    """The largest distance from the in-process simulation (E1: 0); None with the reason where there is none."""
+    """The largest distance from the in-process simulation, 0 if distributed = local; None with the reason if there is
+    none."""
 
     output: float | None
     control_effort: float | None

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -20,6 +20,10 @@ from tdof_npid_ros.cli.gains import gains_by_source
 from tdof_npid_ros.control.gains import PER_LANE, Gains, controller_type
 from tdof_npid_ros.paper.tables import COMPARED, published
 from tdof_npid_ros.parameter_file import find_parameter_file
+
+if TYPE_CHECKING:  # rclpy restarts the interpreter when it is imported
+    from tdof_npid_ros.graph.conductor import Conductor
+    from tdof_npid_ros.graph.processes import NodeProcesses
 
 CASE = "p1-c0.5"
 NAMESPACE = "/demo"
@@ -80,7 +84,7 @@ def _check_free(bag: Path) -> None:
 
 
 @contextmanager
-def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[Any]:
+def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[tuple[Conductor, NodeProcesses]]:
     """The nodes, by name with their parameters, as processes, and a conductor for them; all of it ends with the
     context."""
     from tdof_npid_ros.graph.conductor import Conductor
@@ -88,32 +92,33 @@ def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[Any]:
 
     with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as processes:
         for name, parameters in nodes.items():
-            processes.start(name, parameters)
+            processes.start(name, parameters, ends=name == "tuner")
         conductor = Conductor(NAMESPACE, processes.check)
         try:
-            yield conductor
+            yield conductor, processes
         finally:
             conductor.close()
 
 
 def _tune(result: Path, quiet: bool) -> None:
     """A short run of the tuner node on a loop of its own."""
-    tuner = {"case": CASE, "type": TUNED_TYPE, "generations": GENERATIONS, "result": result, "stay": True}
+    tuner = {"case": CASE, "type": TUNED_TYPE, "generations": GENERATIONS, "result": result}
     if not quiet:
         print(f"Tuning {TUNED_TYPE} through a loop of plant, controller and tuner in {NAMESPACE} …", flush=True)
-    with _loop({"plant": {}, "controller": {}, "tuner": tuner}) as conductor:
-        with tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar:
+    with (
+        _loop({"plant": {}, "controller": {}, "tuner": tuner}) as (conductor, processes),
+        tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar,
+    ):
 
-            def finished() -> bool:
-                best = conductor.fact("tuner", "best")
-                text = "first generation" if best in ("", "inf") else f"best IAE {best[:7]}"
-                bar.set_description(f"{text:16}", refresh=False)
-                bar.update(int(conductor.fact("tuner", "generation") or 0) - bar.n)
-                return conductor.fact("tuner", "state") in ("finished", "failed")
+        def finished() -> bool:
+            best = conductor.fact("tuner", "best")
+            text = "first generation" if best in ("", "inf") else f"best IAE {best[:7]}"
+            bar.set_description(f"{text:16}", refresh=False)
+            bar.update(int(conductor.fact("tuner", "generation") or 0) - bar.n)
+            return processes.has_ended("tuner")
 
-            conductor.wait(finished, "the end of the tuning", PLAY_TIMEOUT)
-        if conductor.fact("tuner", "state") == "failed":
-            raise RuntimeError("the tuner failed: see its log above")
+        conductor.wait(finished, "the end of the tuning", PLAY_TIMEOUT)
+        processes.check()
 
 
 def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> None:
@@ -127,7 +132,7 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
         "controller": lossless,
         "scenario": {"play": False},
     }
-    with _loop(nodes) as conductor:
+    with _loop(nodes) as (conductor, _):
         conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
         episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
         with tqdm(
@@ -136,14 +141,14 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
             for round_, (name, gains) in enumerate(rounds.items()):
                 bar.set_description(f"{name:17}")
                 conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
-                conductor.trigger("scenario/play")
+                conductor.play(PLAY_TIMEOUT)
 
                 def played(round_: int = round_) -> bool:
-                    done = int(conductor.fact("plant", "episode") or 0) - 1 - round_ * len(episode_s)
+                    done = conductor.episodes_finished - round_ * len(episode_s)
                     if 0 <= done < len(episode_s):
                         position = round_ * sum(episode_s) + sum(episode_s[:done]) + conductor.time_ns / 1e9
                         bar.update(max(0.0, min(position, bar.total) - bar.n))
-                    return bool(conductor.fact("scenario", "played") == str(round_ + 1))
+                    return done == len(episode_s)
 
                 conductor.wait(played, f"the end of the episodes with {name}", PLAY_TIMEOUT)
             bar.update(bar.total - bar.n)

@@ -1,4 +1,4 @@
-"""`tdof-npid verify`: E2, every control effort of a bag computed again and compared bit for bit."""
+"""`tdof-npid verify`: every control effort of a bag computed again and compared bit for bit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """exp(-q), the same bits on every processor.
 
 The C library picks its `exp` by processor, and the last bit of the result differs between them; this one is plain
-IEEE arithmetic, so a controller and a simulation on different hosts agree (E1). It also vectorises over lanes.
+IEEE arithmetic, so a controller and a simulation on different hosts agree. It also vectorises over lanes.
 """
 
 from __future__ import annotations

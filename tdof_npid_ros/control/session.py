@@ -119,10 +119,9 @@ class OutputSequence:
 
     def accept(self, place: Place) -> None:
         """The output is answered: it is the latest now."""
-        self.latest = place
-        self._astray = None
+        before, self.latest, self._astray = self.latest, place, None
         label = place.label
-        if label is not None and self._known.get(label.activation) != label:
+        if label is not None and (before is None or label is not before.label):
             self._known[label.activation] = label
             if len(self._known) > REMEMBERED:
                 del self._known[next(iter(self._known))]
@@ -235,6 +234,7 @@ class Session:
         saved_integral: the integral action to join a loop with, (lanes,); None: the one that leaves the effort.
         waiting: an output whose plan has not come.
         silent: no output comes; the next one is joined.
+        is_live: the loop goes on without waiting for answers: in realtime, and on a robot.
         is_out_of_step: the plant in lockstep has another sample period.
     """
 
@@ -253,8 +253,9 @@ class Session:
         self.controller.reset()
         self.sequence = OutputSequence(self.controller.sample_period_ns)
         self.waiting: Sample | None = None
-        self.silent = self.is_out_of_step = False
+        self.silent = self.is_live = self.is_out_of_step = False
         self.answer: Answer | None = None
+        self._answer_label = AnswerLabel("")  # of the latest answer
         self._answered = NO_VALUES  # the latest output that was
         self._arrival_ns: int | None = None
         self._common = np.zeros(self.controller.lanes)
@@ -268,11 +269,6 @@ class Session:
     def stamp_ns(self) -> int | None:
         """Of the latest output that was answered."""
         return self.sequence.latest and self.sequence.latest.stamp_ns
-
-    @property
-    def is_live(self) -> bool:
-        """Whether the loop goes on without waiting for answers: in realtime, and on a robot."""
-        return self.sequence.latest is not None and not (self.label and self.label.plan)
 
     def set_setpoint(self, setpoint: np.ndarray) -> None:
         """Take this setpoint, (1,) or (lanes,), for outputs without a plan."""
@@ -416,9 +412,13 @@ class Session:
         elif decision == "join":
             self._join(applied, integral)
         self.sequence.accept(place)
+        self.is_live = place.label is None or not place.label.plan
         effort = controller.answer(place.stamp_ns, setpoint, output)
         began_with = controller.integral_before if decision == "join" else NO_VALUES
-        self.answer = Answer(place.stamp_ns, AnswerLabel(controller.digest, place.label), setpoint, effort, began_with)
+        label = self._answer_label
+        if label.parameters is not controller.digest or label.episode is not place.label:
+            label = self._answer_label = AnswerLabel(controller.digest, place.label)
+        self.answer = Answer(place.stamp_ns, label, setpoint, effort, began_with)
 
     def _start(self, place: Place, output: np.ndarray, applied: np.ndarray | None) -> None:
         """Begin from rest: settled where the plant rests, or from nothing."""

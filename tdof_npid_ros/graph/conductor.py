@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import Parameter
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
 from tdof_npid_ros.graph.runtime.messages import stamp_ns
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
+from tdof_npid_ros.graph.runtime.parameter_client import RefusedError, RemoteNode
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
+from tdof_npid_ros.wire import EpisodeLabel
 
 POLL = 0.02  # s
 
@@ -25,11 +26,15 @@ class LoopError(RuntimeError):
 
 
 class Conductor:
-    """A client of one loop's nodes.
+    """A client of one loop's nodes. It spins while it waits, so one thread is enough.
 
     Args:
         namespace: of the loop.
         check: called while waiting; raises if waiting is in vain.
+
+    Attributes:
+        time_ns: the loop's time, in lockstep.
+        label, phase: what the plant says of its episode; None and empty before it has said anything.
     """
 
     def __init__(self, namespace: str, check: Callable[[], None]) -> None:
@@ -38,14 +43,27 @@ class Conductor:
         self._node = rclpy.create_node("conductor", namespace=namespace, start_parameter_services=False)
         self._check = check
         self._facts: dict[str, dict[str, str]] = {}
+        self._remotes: dict[str, RemoteNode] = {}
         self.time_ns = 0
+        self.label: EpisodeLabel | None = None
+        self.phase = ""
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._node.create_subscription(Clock, "/clock", self._on_clock, 10)
+        self._node.create_subscription(KeyValue, "episode", self._on_episode, LATCHED_QOS)
 
     def close(self) -> None:
         """Leave the graph."""
         self._node.destroy_node()
         rclpy.try_shutdown()
+
+    def remote(self, node: str) -> RemoteNode:
+        """One of the loop's nodes, `controller` say: its parameters and services."""
+        if node not in self._remotes:
+            name = self._node.resolve_topic_name(node)
+            self._remotes[node] = RemoteNode(self._node, name, check=self._check, pass_time=self._spin)
+        return self._remotes[node]
+
+    # What it hears
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -54,9 +72,21 @@ class Conductor:
     def _on_clock(self, message: Clock) -> None:
         self.time_ns = stamp_ns(message.clock)
 
+    def _on_episode(self, message: KeyValue) -> None:
+        self.label, self.phase = EpisodeLabel.parse(message.key), message.value
+
+    @property
+    def episodes_finished(self) -> int:
+        """How many episodes the plant in lockstep has run to their end since its activation."""
+        if self.label is None:
+            return 0
+        return self.label.number - (self.phase != "finished" and self.label.number > 0)
+
     def fact(self, node: str, key: str) -> str:
-        """What a node's diagnostics say of `key`; empty if nothing yet."""
+        """A figure in a node's latest diagnostics; empty if there is none yet."""
         return self._facts.get(self._node.resolve_topic_name(node), {}).get(key, "")
+
+    # Waiting
 
     def wait(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
         """Serve callbacks until a condition holds.
@@ -79,42 +109,38 @@ class Conductor:
             timeout,
         )
 
-    def set_parameters(self, node: str, parameters: Mapping[str, Any], timeout: float = 10.0) -> None:
+    # Asking for something
+
+    def set_parameters(self, node: str, parameters: Mapping[str, Any]) -> None:
         """Set a node's parameters as a whole.
 
         Raises:
-            LoopError: refused, with the node's reason.
+            RefusedError: with the node's reason.
+            NoAnswerError: it does not answer.
         """
-        request = SetParametersAtomically.Request()
-        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
-        result = self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request, timeout).result
-        if not result.successful:
-            raise LoopError(f"{node} refused {', '.join(parameters)}: {result.reason}")
+        self.remote(node).set_parameters(parameters)
 
-    def trigger(self, service: str, timeout: float = 10.0) -> None:
-        """Call a trigger service.
+    def play(self, timeout: float) -> None:
+        """Let the scenario play its episodes, once it has ended those that it plays now; returns when it has begun.
 
         Raises:
-            LoopError: it reports a failure.
+            LoopError: it has not within `timeout` seconds.
         """
-        response = self.call(Trigger, service, Trigger.Request(), timeout)
-        if not response.success:
-            raise LoopError(f"{service}: {response.message}")
+        before = self.label
+        scenario = self.remote("scenario")
+        asked = scenario.ask_trigger("play")
 
-    def call(self, kind: Any, service: str, request: Any, timeout: float = 10.0) -> Any:
-        """A service's answer.
+        def begun() -> bool:
+            nonlocal asked
+            if not asked.look():
+                return self.label != before
+            try:
+                return bool(asked.answer)
+            except RefusedError:  # still playing
+                asked = scenario.ask_trigger("play")
+                return False
 
-        Args:
-            kind: the service's type.
+        self.wait(begun, "the scenario's beginning", timeout)
 
-        Raises:
-            LoopError: there is none within `timeout` seconds.
-        """
-        client = self._node.create_client(kind, service)
-        try:
-            self.wait(client.service_is_ready, f"the service {service}", timeout)
-            future = client.call_async(request)
-            self.wait(future.done, f"an answer of {service}", timeout)
-            return future.result()
-        finally:
-            self._node.destroy_client(client)
+    def _spin(self, event: threading.Event, seconds: float) -> None:
+        rclpy.spin_once(self._node, timeout_sec=seconds)

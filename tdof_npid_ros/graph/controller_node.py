@@ -23,20 +23,13 @@ from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
 from tdof_npid_ros.control.session import FAR_IN_SIGMA, OUT_OF_STEP, Answer, Outcome, Session
-from tdof_npid_ros.graph.runtime.endpoints import signal_qos
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
-from tdof_npid_ros.graph.runtime.node import (
-    ERROR,
-    LATCHED_QOS,
-    OK,
-    SIGNAL_QOS,
-    STEADY,
-    WARN,
-    run_node,
-)
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS, signal_qos
+from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameters import CONTROLLER, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
-from tdof_npid_ros.wire import Sample, SignalWriter
+from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
 
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 
@@ -72,7 +65,7 @@ class ControllerNode(LoopEnd):
         self.session.begin()
         self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
         self.effort = SignalWriter()
-        self.effort_label = ""
+        self.effort_label: AnswerLabel | None = None
         self.terms = SignalWriter()
         self.terms_for = 0
         qos = self.promised_qos()
@@ -134,10 +127,9 @@ class ControllerNode(LoopEnd):
         self._account_for(outcome)  # the plant waits for the answer, so all else comes after it
 
     def _message(self, answer: Answer) -> bytes:
-        label = str(answer.label)
-        if self.effort_label != label:
-            self.effort_label = label
-            self.effort.label(label, self.joints.names or lane_names(self.controller.lanes))
+        if answer.label is not self.effort_label:
+            self.effort_label = answer.label
+            self.effort.label(str(answer.label), self.joints.names or lane_names(self.controller.lanes))
         # The first answer within a running loop bears the integral action that it began with, for `verify`.
         return self.effort.write(
             answer.stamp_ns, position=answer.setpoint, velocity=answer.began_with, effort=answer.effort

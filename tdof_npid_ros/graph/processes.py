@@ -41,6 +41,13 @@ def _interrupted_afterwards() -> Iterator[None]:
 class NodeProcesses:
     """Starts nodes and stops all of them on leaving the context.
 
+        with NodeProcesses(file, "/loop") as nodes:
+            nodes.start("plant", {"lossless": True})
+            nodes.start("tuner", {"case": "p1-c4"}, ends=True)
+            while not nodes.has_ended("tuner"):
+                nodes.check()
+                ...
+
     Args:
         parameter_file: given to every node.
         namespace: in which they run.
@@ -50,10 +57,19 @@ class NodeProcesses:
         self._parameter_file = parameter_file
         self._namespace = namespace
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._end_by_themselves: set[str] = set()
         self._logs = Path(tempfile.mkdtemp(prefix="tdof-npid-"))
 
-    def start(self, node: str, parameters: Mapping[str, Any] | None = None) -> None:
-        """Start a node, its log in a temporary file."""
+    def start(self, node: str, parameters: Mapping[str, Any] | None = None, ends: bool = False) -> None:
+        """Start a node, its log in a temporary file.
+
+        Args:
+            node: plant, controller, scenario, tuner, recorder or replay.
+            parameters: by name, after those of the file.
+            ends: it ends by itself when it is done; every other node that ends has failed.
+        """
+        if ends:
+            self._end_by_themselves.add(node)
         command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "-r", f"__ns:={self._namespace}"]
         command += ["--params-file", str(self._parameter_file)]
         for name, value in (parameters or {}).items():
@@ -68,14 +84,18 @@ class NodeProcesses:
         """Where a node's log is."""
         return self._logs / f"{node}.log"
 
+    def has_ended(self, node: str) -> bool:
+        """Whether a node's process has ended."""
+        return self._processes[node].poll() is not None
+
     def check(self) -> None:
         """Make sure that all nodes run.
 
         Raises:
-            NodeProcessError: one has ended.
+            NodeProcessError: one has ended that should not have, or with an error.
         """
         for node, process in self._processes.items():
-            if process.poll() is not None:
+            if process.poll() is not None and (process.returncode or node not in self._end_by_themselves):
                 tail = " | ".join(self.log(node).read_text(errors="replace").strip().splitlines()[-5:])
                 raise NodeProcessError(f"the node {node} ended with status {process.returncode}: {tail}")
 

@@ -20,7 +20,9 @@ from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
 from tdof_npid_ros.graph.runtime.messages import set_stamp
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, LoopNode, run_node
+from tdof_npid_ros.graph.runtime.node import OK, LoopNode
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS
+from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.one_line import one_line

@@ -6,22 +6,25 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
+from diagnostic_msgs.msg import KeyValue
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from tdof_npid_ros.graph.plant.port import EPISODE
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS, OK, SIGNAL_QOS, STEADY, LoopNode, run_node
+from tdof_npid_ros.graph.runtime.node import OK, STEADY, LoopNode
+from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS
+from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameters import PLAN, SCENARIO, sample_period_in_ns
 from tdof_npid_ros.scenario import Plan, parse_plan, read_episodes
+from tdof_npid_ros.wire import EpisodeLabel
 
 PLANT = "plant."  # what begins the name of a plant's parameter in a plan
-ASK_AGAIN_NS = 300_000_000  # an answer is lost if the plant has not found this node yet
-PLANT_TIMEOUT_NS = 3_000_000_000  # in realtime, an episode waits so long for a plant that can be reset
+PLANT_TIMEOUT_NS = 3_000_000_000  # an episode waits so long for a plant that tells of its episodes and can be reset
+LOOK_PERIOD = 0.1  # s between two looks, in lockstep, whether the plant is there
 
 
 class ScenarioNode(LoopNode):
@@ -41,12 +44,7 @@ class ScenarioNode(LoopNode):
         self._read_plans({})
         self.accept_changes()
         self.played = 0
-        self.reported_episode = 0  # by the plant
-        self.finished = (0, "")  # the plant's latest episode, and its plan, that was played to its end
-        self.plant_before: list[Parameter] = []  # in realtime: what the plan has changed of the plant, as it was
-        self.restored: Any = None  # the future of the plant's answer to that
-        self.told: Any = None  # and of the one to what it is before,
-        self.asked_ns = 0  # and when that was asked for
+        self.label: EpisodeLabel | None = None  # of the plant's episode, as it tells; None: it has told nothing yet
         self.queue: list[Plan] = []
         self.current: Plan | None = None
 
@@ -58,15 +56,19 @@ class ScenarioNode(LoopNode):
             for name in ("setpoint", "disturbance")
         }
         self.create_service(Trigger, "scenario/play", self._on_play)
-        self.plant_name = self.resolve_topic_name("plant")
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.label = None
+        self.plant_before: dict[str, Any] = {}  # in realtime: what the plan has changed of the plant, as it was
+        self.setting: Question[dict[str, str]] | None = None  # of the plant's parameters, the latest
+        self.values_set: dict[str, Any] = {}  # what it asks for
+        self.before: EpisodeLabel | None = None  # the plant's label before it was asked for an episode
+        self.plant = RemoteNode(self, self.resolve_topic_name("plant"))
+        self.subscribe(KeyValue, EPISODE, self._on_episode, LATCHED_QOS)
         if self.mode == "lockstep":
             self.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
+            self.create_timer(LOOK_PERIOD, self._publish_plan_if_time, clock=STEADY)
         else:
-            self.reset_client = self.create_client(Trigger, "plant/reset")
-            self.get_client = self.create_client(GetParameters, "plant/get_parameters")
-            self.set_client = self.create_client(SetParameters, "plant/set_parameters")
             self.create_timer(self.period_ns / 1e9 / self.speed, self._on_tick, clock=STEADY)
+            self.plant.serves("reset")  # the client is there before it is needed
         if self.play_at_start:
             self._play()
 
@@ -100,49 +102,45 @@ class ScenarioNode(LoopNode):
             return
         self.current = self.queue.pop(0)
         self.point = -1
-        self.started_ns: int | None = None
+        self.begun = False  # in lockstep: the plan is published; in realtime: it is played
+        self.started_ns = 0
+        self.told: Question[dict[str, Any]] | None = None  # what the plan will change of the plant
+        self.resetting: Question[str] | None = None
         self.wait_until_ns = STEADY.now().nanoseconds + PLANT_TIMEOUT_NS
         if self.mode == "lockstep":
+            self._publish_plan_if_time()
+
+    def _publish_plan_if_time(self) -> None:
+        """In lockstep: once the plant tells of its episodes, so that ours can be told from those before."""
+        if self.current is None or self.begun:
+            return
+        if self.label is not None or STEADY.now().nanoseconds > self.wait_until_ns:
+            self.before = self.label
             self._publish_plan(self.current)
 
     def _publish_plan(self, plan: Plan) -> None:
+        self.begun = True
         self.plan_publisher.publish(plan_message(plan, 0))
         self._advance_to(0)
-
-    def _begin(self, plan: Plan) -> None:
-        """In realtime: the plant to its initial state, and the plan's first values."""
-        if self.reset_client.service_is_ready():
-            self.reset_client.call_async(Trigger.Request())
-        else:
-            self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
-        self.started_ns = STEADY.now().nanoseconds
-        self._publish_plan(plan)
 
     def _on_matched(self, status: Any) -> None:
         """A latecomer, a controller started again for one, is told what holds now."""
         if self.mode == "realtime" and self.current is not None and status.current_count_change > 0 <= self.point:
             self._publish_signals(self.current, self.point)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name != self.plant_name:
-                continue
-            facts = {pair.key: pair.value for pair in status.values}
-            try:
-                episode = int(facts.get("episode", 0))
-            except ValueError:
-                self.refuse("rejected", "diagnostics of the plant refused: its episode is no number")
-                continue
-            if episode < self.reported_episode:  # the plant has been started again, and counts anew
-                self.finished = (0, "")
-            self.reported_episode = episode
-            if self.mode != "lockstep" or self.current is None or facts.get("state") != "finished":
-                continue
-            report = (episode, self.current.digest)
-            if facts.get("plan") == self.current.digest and report != self.finished:
-                self.finished = report
-                self._advance_to(self.current.end_ns)
-                self._next()
+    def _on_episode(self, message: KeyValue) -> None:
+        label = EpisodeLabel.parse(message.key)
+        if label is None:
+            self.refuse("rejected", "episode refused: its key is no label")
+            return
+        self.label = label
+        if self.mode != "lockstep" or self.current is None:
+            return
+        if not self.begun:
+            self._publish_plan_if_time()
+        elif message.value == "finished" and label.plan == self.current.digest and label != self.before:
+            self._advance_to(self.current.end_ns)
+            self._next()
 
     def _on_clock(self, message: ClockMessage) -> None:
         self._advance_to(stamp_ns(message.clock))
@@ -150,11 +148,11 @@ class ScenarioNode(LoopNode):
     def _on_tick(self) -> None:
         if self.current is None:
             return
+        if self.setting is not None:
+            self.setting.look()
         now = STEADY.now().nanoseconds
-        if self.started_ns is None:
-            is_there = self.reset_client.service_is_ready() or now > self.wait_until_ns
-            if is_there and self._knows_plant(self.current, now):
-                self._begin(self.current)
+        if not self.begun:
+            self._begin_if_ready(self.current, now)
             return
         now = int((now - self.started_ns) * self.speed)
         self._advance_to(now)
@@ -172,7 +170,8 @@ class ScenarioNode(LoopNode):
             if self.mode == "realtime":
                 before = plan.values[self.point - 1] if self.point else [None] * len(plan.names)
                 row = zip(plan.names, before, plan.values[self.point], strict=True)
-                self._set_plant([_double(name, now) for name, was, now in row if name.startswith(PLANT) and now != was])
+                changes = {name: now for name, was, now in row if name.startswith(PLANT) and now != was}
+                self._set_plant({name.removeprefix(PLANT): value for name, value in changes.items()})
 
     def _publish_signals(self, plan: Plan, point: int) -> None:
         row = dict(zip(plan.names, plan.values[point], strict=True))
@@ -184,44 +183,63 @@ class ScenarioNode(LoopNode):
             setattr(message, field, [row.get(name, 0.0)])
             publisher.publish(message)
 
-    def _knows_plant(self, plan: Plan, now: int) -> bool:
-        """Whether the plant is as configured, and has told what that is, so that it can be so for the next episode."""
-        if self.restored is not None and not self.restored.done() and now < self.wait_until_ns:
-            return False
+    # The plant, in realtime
+
+    def _begin_if_ready(self, plan: Plan, now: int) -> None:
+        """Play once the plant has its own parameters again, has told them, and has begun from its initial state."""
+        late = now > self.wait_until_ns
+        if not late and not (self._is_restored() and self._is_known(plan) and self._is_reset()):
+            return
+        if self.resetting is None:
+            self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
+        else:
+            self.resetting.drop()
+        self.started_ns = now
+        self._publish_plan(plan)
+
+    def _is_restored(self) -> bool:
+        return self.setting is None or self.setting.look()
+
+    def _is_known(self, plan: Plan) -> bool:
+        """Whether the plant has told what the plan will change, so that it can be so again for the next episode."""
         names = [name.removeprefix(PLANT) for name in plan.names if name.startswith(PLANT)]
         if not names:
             return True
-        if self.told is None or not self.told.done():
-            if self.get_client.service_is_ready() and now - self.asked_ns > ASK_AGAIN_NS:
-                if self.told is None:
-                    self.wait_until_ns = now + PLANT_TIMEOUT_NS
-                self.told, self.asked_ns = self.get_client.call_async(GetParameters.Request(names=names)), now
-            return bool(now > self.wait_until_ns)
-        values = self.told.result().values
-        found = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=False)]
-        self.plant_before = [
-            parameter for parameter in found if parameter.value.type != ParameterType.PARAMETER_NOT_SET
-        ]
+        self.told = self.told or self.plant.ask_parameters(names)
+        if not self.told.look():
+            return False
+        self.plant_before = {name: value for name, value in self.told.answer.items() if value is not None}
         return True
 
+    def _is_reset(self) -> bool:
+        """Whether the plant has been asked to begin an episode, and tells or answers that it has."""
+        if self.resetting is None:
+            if not self.plant.serves("reset"):
+                return False
+            self.before = self.label
+            self.resetting = self.plant.ask_trigger("reset", repeats=True)
+        return self.resetting.look() or self.label != self.before
+
     def _restore_plant(self) -> None:
-        before, self.plant_before = self.plant_before, []
-        self.restored, self.told, self.asked_ns = self._set_plant(before), None, 0
+        before, self.plant_before = self.plant_before, {}
+        self._set_plant(before)
 
-    def _set_plant(self, parameters: list[Parameter]) -> Any:
-        """Set them; returns the future of the plant's answer, None if there are none."""
-        if not parameters:
-            return None
+    def _set_plant(self, values: dict[str, Any]) -> None:
+        """Set parameters of the plant; those refused are not restored either."""
+        if not values:
+            return
+        if self.setting is not None and not self.setting.look():  # it must not come after this one
+            self.setting.drop()
+            values = {**self.values_set, **values}
+        self.values_set = values
+        setting = self.setting = self.plant.ask_to_set_each(values)
 
-        def look(answer: Any) -> None:
-            for parameter, result in zip(parameters, answer.result().results, strict=False):
-                if not result.successful:
-                    self.plant_before = [before for before in self.plant_before if before.name != parameter.name]
-                    self.refuse("rejected", f"{PLANT}{parameter.name} was refused by the plant", f": {result.reason}")
+        def look() -> None:
+            for name, reason in setting.answer.items():
+                self.plant_before.pop(name, None)
+                self.refuse("rejected", f"{PLANT}{name} was refused by the plant", f": {reason}")
 
-        future = self.set_client.call_async(SetParameters.Request(parameters=parameters))
-        future.add_done_callback(look)
-        return future
+        setting.then(look)
 
     # Parameters and state
 
@@ -254,12 +272,6 @@ class ScenarioNode(LoopNode):
         if self.current:
             facts["plan"] = self.current.digest
         return OK, str(facts["state"]), facts
-
-
-def _double(name: str, value: float) -> Parameter:
-    """A change of the plan, `plant.gain` say, as the plant's parameter."""
-    kind = ParameterType.PARAMETER_DOUBLE
-    return Parameter(name=name.removeprefix(PLANT), value=ParameterValue(type=kind, double_value=value))
 
 
 def main(args: list[str] | None = None) -> None:

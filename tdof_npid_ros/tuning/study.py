@@ -57,7 +57,8 @@ class TuningResult:
 
 
 class Study:
-    """One tuning run; the outcome depends on the problem alone, however often it is stopped and resumed (E4)."""
+    """One tuning run; the outcome depends on the problem alone, however often it is stopped and
+    resumed (resumed = uninterrupted)."""
 
     def __init__(self, problem: TuningProblem, checkpoint: Path | None = None, resume: bool = False) -> None:
         """

@@ -1,4 +1,4 @@
-"""E2: `verify` finds every bit that is off, and says what it could not check."""
+"""replayed = recorded: `verify` finds every bit that is off, and says what it could not check."""
 
 from dataclasses import replace
 

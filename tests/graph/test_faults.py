@@ -196,22 +196,22 @@ def test_malformed_messages_on_every_topic(live: Live) -> None:
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-def test_malformed_diagnostics_clocks_and_accounts_end_no_node(graph: Any, mode: str) -> None:
+def test_malformed_episodes_clocks_and_accounts_end_no_node(graph: Any, mode: str) -> None:
     """What scenario and plant hear of each other, forged."""
     from builtin_interfaces.msg import Time
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from diagnostic_msgs.msg import KeyValue
     from rosgraph_msgs.msg import Clock
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Header
 
+    from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
+
     rng = random.Random(2)
     words = ["", "x", "-1", "9" * 5000, "nan", "finished", "\u0663", "1e9"]
 
-    def diagnostics() -> Any:
-        facts = [
-            KeyValue(key=key, value=rng.choice(words)) for key in ("episode", "state", "plan") if rng.random() < 0.9
-        ]
-        return DiagnosticArray(status=[DiagnosticStatus(name="/plant", level=b"\xff", values=facts)])
+    def episode() -> Any:
+        labels = [*words, "-/a.1", f"{'0' * 12}/a.{'9' * 18}", f"{'0' * 12}/a.\u0663"]
+        return KeyValue(key=rng.choice(labels), value=rng.choice(words))
 
     def time() -> Any:
         return Time(sec=rng.randint(-(2**31), 2**31 - 1), nanosec=rng.randint(0, 2**32 - 1))
@@ -222,12 +222,12 @@ def test_malformed_diagnostics_clocks_and_accounts_end_no_node(graph: Any, mode:
     scenario = graph.start("scenario", mode=mode, episodes=["e"], plan__e=plan)
     graph.wait_for_nodes("/plant", "/controller", "/scenario")
     makers = {
-        "/diagnostics": (DiagnosticArray, diagnostics),
+        "/episode": (KeyValue, episode),
         "/clock": (Clock, lambda: Clock(clock=time())),
         "/recorded": (JointState, lambda: JointState(header=Header(stamp=time(), frame_id=rng.choice(words)))),
     }
     for topic, (kind, make) in makers.items():
-        publisher = graph.node.create_publisher(kind, topic, 10)
+        publisher = graph.node.create_publisher(kind, topic, LATCHED_QOS)
         for _ in range(MALFORMED):
             publisher.publish(make())
             graph.spin_once(0.0)

@@ -1,4 +1,4 @@
-"""The loop's nodes as processes: E1, order of starting, refusals, endings."""
+"""The loop's nodes as processes: distributed = local, order of starting, refusals, endings."""
 
 from __future__ import annotations
 
@@ -169,7 +169,8 @@ def test_a_destroyed_node_leaves_the_domain_before_its_process_ends(graph: Any) 
 
 STUCK = """
 import ctypes, sys
-from tdof_npid_ros.graph.runtime.node import LoopNode, run_node
+from tdof_npid_ros.graph.runtime.node import LoopNode
+from tdof_npid_ros.graph.runtime.run import run_node
 
 class Stuck(LoopNode):
     def destroy_node(self):
@@ -220,7 +221,7 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
     from trajectory_msgs.msg import JointTrajectory
 
     from tdof_npid_ros.graph.runtime.messages import plan_message
-    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 
     graph.start("controller")
     plan = load_case("p1-c0.5").plans["setpoint"]
@@ -331,7 +332,7 @@ def test_what_a_plant_cannot_do_is_refused_and_it_goes_on(graph: Any) -> None:
     from trajectory_msgs.msg import JointTrajectory
 
     from tdof_npid_ros.graph.runtime.messages import plan_message
-    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 
     plant = graph.start("plant", model="third_order", mode="lockstep")
     graph.wait_for_nodes("/plant")
@@ -352,7 +353,7 @@ def test_a_lockstep_plant_that_is_activated_again_begins_anew(graph: Any) -> Non
     from trajectory_msgs.msg import JointTrajectory
 
     from tdof_npid_ros.graph.runtime.messages import plan_message
-    from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+    from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 
     outputs = graph.collect("output", JointState)
     graph.start("plant", mode="lockstep", case="p1-c0.5")

@@ -24,7 +24,8 @@ WAYS: dict[str, list[dict[str, Any]]] = {
     "plant": [{"mode": "lockstep", "lossless": True}, {"mode": "realtime"}],
     "controller": [{}],
     "scenario": [
-        {"mode": mode, "episodes": ["e"], "plan__e": ["0 setpoint 1", "60 end"]} for mode in ("lockstep", "realtime")
+        {"mode": mode, "episodes": ["e"], "plan__e": ["0 setpoint 1", "0 plant.gain 1", "60 end"]}
+        for mode in ("lockstep", "realtime")
     ],
     "tuner": [{"answer_timeout": 1.0}, {"answer_timeout": 1.0, "episode": "alternate"}],
     "replay": [{"bag": "BAG", "rate": 1e-4, "clock": True}, {"bag": "BAG", "compare": True}],

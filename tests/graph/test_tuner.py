@@ -1,4 +1,4 @@
-"""The tuner over real nodes: E3 and E4, several loops, faults, and a plant that cannot be reset."""
+"""The tuner over real nodes: the equalities of tuning, several loops, faults, and a plant that cannot be reset."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def tuner_file(tmp_path: Path) -> Callable[[str], Path]:
     return write
 
 
-# E3 and E4
+# tuned live = tuned offline, resumed = uninterrupted
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -280,7 +280,7 @@ def test_a_silent_loop_ends_the_tuning_with_the_reason(loops: Any, tuner: LiveTu
 CAREFUL_CONTROLLER = """
 import sys
 from tdof_npid_ros.graph.controller_node import ControllerNode
-from tdof_npid_ros.graph.runtime.node import run_node
+from tdof_npid_ros.graph.runtime.run import run_node
 
 class CarefulController(ControllerNode):
     def checked(self, changes):

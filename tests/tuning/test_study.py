@@ -1,4 +1,4 @@
-"""Studies: ask and tell, checkpoints, and E4: resumed = uninterrupted."""
+"""Studies: ask and tell, checkpoints, and resumed = uninterrupted."""
 
 from __future__ import annotations
 

@@ -10,7 +10,8 @@ from trajectory_msgs.msg import JointTrajectory
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.recorder.lossless import Log
 from tdof_npid_ros.graph.runtime.messages import plan_from_message, set_stamp
-from tdof_npid_ros.graph.runtime.node import ERROR, LATCHED_QOS, OK, RECENT_QOS, STEADY, WARN
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, RECENT_QOS
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import AnswerLabel, Sample

@@ -15,7 +15,7 @@ from tdof_npid_ros.graph.plant.lockstep import LockstepPlant
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.plant.realtime import RealtimePlant
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
-from tdof_npid_ros.graph.runtime.node import run_node
+from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.parameters import PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import effort_limits, make_plant, model_table, named_model

@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
 from tdof_npid_ros.graph.runtime.messages import lane_names
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros.graph.plant.port import PlantPort
-from tdof_npid_ros.graph.runtime.endpoints import signal_qos
 from tdof_npid_ros.graph.runtime.loop_end import patience_ns
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.qos import signal_qos
 from tdof_npid_ros.graph.runtime.realtime import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
 from tdof_npid_ros.wire import Sample

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS, LoopNode
+from tdof_npid_ros.graph.runtime.node import LoopNode
+from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.wire import Sample
 
 TOPIC = "recorded"

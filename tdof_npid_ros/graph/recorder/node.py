@@ -29,7 +29,9 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
 from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
-from tdof_npid_ros.graph.runtime.node import ERROR, OK, SIGNAL_QOS, STEADY, WARN, LoopNode, run_node
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, LoopNode
+from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
+from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.names import in_namespace

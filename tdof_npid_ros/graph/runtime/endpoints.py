@@ -5,31 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
-    HistoryPolicy,
-    LivelinessPolicy,
     QoSCompatibility,
     QoSProfile,
-    ReliabilityPolicy,
     qos_check_compatible,
 )
 
 LOOKS = 5  # looks, one a second, after something has changed: names of nodes arrive later than their topics
 FOREVER_NS = 2**62
-
-
-def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0) -> QoSProfile:
-    """Reliable, the latest `depth`; deadline and liveliness lease in s, 0 for none."""
-    profile = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-    if deadline > 0:
-        profile.deadline = Duration(nanoseconds=round(deadline * 1e9))
-    if lease > 0:
-        profile.liveliness = LivelinessPolicy.AUTOMATIC
-        profile.liveliness_lease_duration = Duration(nanoseconds=round(lease * 1e9))
-    return profile
 
 
 class Endpoints:

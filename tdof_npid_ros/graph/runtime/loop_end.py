@@ -6,8 +6,8 @@ import numpy as np
 from rclpy.qos import QoSProfile
 
 from tdof_npid_ros.control.joints import all_within, fault_of
-from tdof_npid_ros.graph.runtime.endpoints import signal_qos
-from tdof_npid_ros.graph.runtime.node import RECENT, RECENT_QOS, LoopNode
+from tdof_npid_ros.graph.runtime.node import LoopNode
+from tdof_npid_ros.graph.runtime.qos import RECENT, RECENT_QOS, signal_qos
 from tdof_npid_ros.graph.runtime.realtime import prepare_for_realtime
 
 PATIENCE_PERIODS = 3  # without a signal: no silence yet, however slow the loop

@@ -1,50 +1,33 @@
-"""What the loop's nodes share: parameters, diagnostics, warnings, life cycle and `main`."""
+"""What the loop's nodes share: parameters, diagnostics, warnings and life cycle."""
 
 from __future__ import annotations
 
 import copy
 import functools
-import signal
-import socket
-import sys
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
-from tdof_npid_ros.graph.runtime.ending import end_within
-from tdof_npid_ros.graph.runtime.endpoints import Endpoints, signal_qos
+from tdof_npid_ros.graph.runtime.endpoints import Endpoints
 from tdof_npid_ros.graph.runtime.messages import diagnostics_message
-from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.runtime.own_services import guard_services
 from tdof_npid_ros.graph.runtime.realtime import collect_garbage
+from tdof_npid_ros.graph.runtime.unread import take_unread
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameter import Parameter, Table, infinity_as_float
 from tdof_npid_ros.parameters import AUTOSTART, misspelt
 from tdof_npid_ros.wire import Sample, SignalReader
 
-SIGNAL_QOS = signal_qos(1000)
-RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
-RECENT_QOS = signal_qos(RECENT)
-LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD = 1.0  # s
-REQUESTS_AT_ONCE = 30  # that are served between two executors: more than clients of a node send at the same time
-LEAVE_TIMEOUT = 2.0  # s until a process ends that the middleware does not let go of
-SPIN_TIMEOUT = 0.5  # s; the events executor needs one (without it, this build spins a core)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
 
@@ -309,6 +292,8 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._diagnostics_publisher.publish(diagnostics_message(stamp, name, level, text, {**facts, **self.counts}))
 
     def _on_diagnostics_timer(self) -> None:
+        if self.uses_events_executor:
+            take_unread(self)
         self.endpoints.look()
         self.publish_diagnostics()
         collect_garbage()
@@ -388,150 +373,3 @@ def as_float(value: Any) -> Any:
     if isinstance(value, list):
         return [as_float(one) for one in value]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-def run_node(make_node: Callable[[], LoopNode], arguments: list[str] | None = None) -> None:
-    """Run a node until a signal; exit status 0 on a signal, 2 if it cannot start, with one line that says why."""
-    stop = Stop()
-    node = None
-    status = 1
-    try:
-        with _start_errors():
-            use_fast_dds_profile()
-            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-            node = make_node()
-            if node.autostart:
-                autostart(node)
-        spin(node, stop)
-        status = 0
-    except StartError as error:
-        print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
-        status = 2
-    finally:
-        if node is not None:
-            _end(node, status)
-        rclpy.try_shutdown()
-        ignore_further_signals()
-    sys.exit(status)
-
-
-class StartError(RuntimeError):
-    """A node that cannot start; the message says why."""
-
-
-@contextmanager
-def _start_errors() -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, OSError, RuntimeError) as error:
-        raise StartError(one_line(error)) from error
-
-
-def autostart(node: LoopNode) -> None:
-    """Configure and activate a node.
-
-    Raises:
-        RuntimeError: it cannot be activated; the message says why.
-    """
-    node.trigger_configure()
-    node.trigger_activate()
-    if node.activation_error is not None:
-        raise RuntimeError(one_line(node.activation_error)) from node.activation_error
-
-
-def _end(node: LoopNode, status: int) -> None:
-    try:
-        if node.active:
-            node.deactivate()
-    finally:
-        end_within(LEAVE_TIMEOUT, status)
-        node.destroy_node()
-
-
-class Stop:
-    """Takes the signals to stop, so that the node ends between two callbacks and in order.
-
-    The executor waits in C++, where no Python handler runs. So a signal is passed through a socket to a thread that
-    wakes the executor. Signals that follow are ignored: the node is ending.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._wake: Callable[[], None] | None = None
-        self._reader, self._writer = socket.socketpair()
-        self._writer.setblocking(False)
-        signal.set_wakeup_fd(self._writer.fileno())
-        for number_ in STOP_SIGNALS:
-            signal.signal(number_, lambda *_: None)
-        threading.Thread(target=self._wait, daemon=True).start()
-
-    def _wait(self) -> None:
-        self._reader.recv(1)
-        self.requested = True
-        wake = self._wake
-        if wake is not None:
-            wake()
-
-    def wakes(self, executor: Any | None) -> None:
-        """Wake this executor, or none, when the signal comes."""
-        self._wake = executor and executor.wake
-
-
-def ignore_further_signals() -> None:
-    """For the end of the process, also while the interpreter shuts down."""
-    for each in STOP_SIGNALS:
-        signal.signal(each, signal.SIG_IGN)
-
-
-def spin(node: LoopNode, stop: Stop | None = None) -> None:
-    """Serve a node until it is to stop, or until its context is shut down."""
-    while rclpy.ok() and not (stop and stop.requested):
-        _spin_until_leftovers(node, stop)
-        if node.leftovers:
-            _destroy_leftovers(node)
-
-
-def _spin_until_leftovers(node: LoopNode, stop: Stop | None) -> None:
-    executor = executor_for(node)
-    if stop is not None:
-        stop.wakes(executor)
-    while rclpy.ok() and not (stop and stop.requested) and not node.leftovers:
-        executor.spin_once(timeout_sec=SPIN_TIMEOUT)
-    if stop is not None:
-        stop.wakes(None)
-    executor.remove_node(node)
-    executor.shutdown()
-
-
-def _destroy_leftovers(node: LoopNode) -> None:
-    """Destroy what a transition has left, between two executors.
-
-    The events executor ends the process over an event of something that is destroyed (ros2/rclpy issue 1644), also over
-    one that came before. What the node has heard of but not served yet, a request for one, would be lost with it; so
-    an executor that looks at what is there, not at events, serves that meanwhile.
-    """
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    for _ in range(REQUESTS_AT_ONCE):
-        executor.spin_once(timeout_sec=0.0)
-    for destroy in node.leftovers:
-        destroy()
-    node.leftovers = []
-    executor.remove_node(node)
-    executor.shutdown()
-
-
-def executor_for(node: LoopNode) -> Any:
-    """An executor that serves this node: the fastest, unless the node needs one that knows callback groups."""
-    executor = fastest_executor() if node.uses_events_executor else SingleThreadedExecutor()
-    executor.add_node(node)
-    return executor
-
-
-def fastest_executor() -> Any:
-    """The fastest executor for one node that this rclpy has."""
-    try:
-        from rclpy.experimental import EventsExecutor  # in Jazzy since 2025, and two to three times as fast
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()

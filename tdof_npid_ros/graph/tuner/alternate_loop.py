@@ -13,9 +13,9 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
 from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
-from tdof_npid_ros.graph.runtime.node import SIGNAL_QOS
-from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
+from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
+from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
@@ -61,7 +61,7 @@ class AlternateLoop:
         self._loop_timeout = loop_timeout
         self._answer_timeout = answer_timeout
         self._check = check
-        self._controller = RemoteNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
+        self._controller = TunedNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
         self._good: Gains | None = None
         self._best = float("inf")
         self._level = test.levels[0]
@@ -210,7 +210,7 @@ class AlternateLoop:
             if watching.setpoint != before:
                 self._publish_setpoint(watching.setpoint)
             if watching.outcome == "unsafe":
-                self._controller.request_parameters(self._at_rest())  # at once, from here
+                self._controller.ask_to_set(self._at_rest())  # at once, from here
                 self._publish_setpoint(watching.before)
             ended = watching.outcome != ""
         elif watching is not None:

@@ -15,9 +15,9 @@ from trajectory_msgs.msg import JointTrajectory
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_candidates, gains_from_mapping
 from tdof_npid_ros.graph.runtime.messages import plan_message
-from tdof_npid_ros.graph.runtime.node import LATCHED_QOS
-from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
+from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.plants.catalog import model_parameters
@@ -56,8 +56,8 @@ class LoopClient:
         self._problem = problem
         self._answer_timeout = answer_timeout
         self._check = check
-        self.plant = RemoteNode(node, in_namespace(namespace, "plant"), answer_timeout, check)
-        self.controller = RemoteNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
+        self.plant = TunedNode(node, in_namespace(namespace, "plant"), answer_timeout, check)
+        self.controller = TunedNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
         self._outputs: EpisodeOutputs | None = None
         self._moved = threading.Condition()  # an episode has begun, or ended
         self._episode: EpisodeLabel | None = None  # the latest that the plant has told of
@@ -210,7 +210,7 @@ def _plant_parameters(case: Case) -> dict[str, Any]:
     }
 
 
-def _compare(remote: RemoteNode, wanted: dict[str, Any], case: str) -> None:
+def _compare(remote: TunedNode, wanted: dict[str, Any], case: str) -> None:
     # Another model has other parameters, and a node gives none if it lacks one: so these first.
     first = [name for name in ("mode", "model") if name in wanted]
     for names in (first, [name for name in wanted if name not in first]):

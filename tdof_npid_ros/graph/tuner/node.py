@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
-from typing import Protocol
+from typing import Any, Protocol
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
 from tdof_npid_ros.case import Case, load_case, read_bounds
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.graph.runtime.ending import end_within
 from tdof_npid_ros.graph.runtime.messages import signal_message
-from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.runtime.node import (
-    ERROR,
-    LATCHED_QOS,
-    LEAVE_TIMEOUT,
-    OK,
-    STOP_SIGNALS,
-    LoopNode,
-    autostart,
-    executor_for,
-    ignore_further_signals,
-)
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, LoopNode
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
+from tdof_npid_ros.graph.runtime.run import Stop, run_node
 from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
 from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
 from tdof_npid_ros.output_file import check_writable
@@ -111,6 +98,16 @@ class TunerNode(LoopNode):
     def deactivate(self) -> None:
         """Stop, as at a signal."""
         self.interrupt()
+
+    def _while_active(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """Also afterwards: `run` hears the loop until it has left it in order."""
+        return callback
+
+    def destroy_node(self) -> None:
+        """As `LoopNode.destroy_node`, after the loops have been left."""
+        if self.activated.is_set():
+            self.evaluator.close()
+        super().destroy_node()
 
     def _leave_what_activate_created(self) -> None:
         """Not yet: `run` needs it to leave the loop in order, and it is destroyed with the node."""
@@ -268,36 +265,11 @@ def _path(name: str) -> Path | None:
     return Path(name) if name else None
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the node: exit status 0 when finished or interrupted, 2 when it fails."""
-    use_fast_dds_profile()
-    rclpy.init(args=sys.argv if args is None else args, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        status = _serve(TunerNode())
-    except (ValueError, OSError) as error:
-        print(f"tuner: {error}", file=sys.stderr)
-        status = FAILURE
-    rclpy.try_shutdown()
-    ignore_further_signals()
-    sys.exit(status)
-
-
-def _serve(node: TunerNode) -> int:
-    """Run the node while another thread spins it; returns the exit status."""
-    stopped, ended = threading.Event(), threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stopped.set()
-        node.interrupt()
-
-    for each in STOP_SIGNALS:
-        signal.signal(each, on_signal)
-    spinner = threading.Thread(target=_spin, args=(node, ended), name="spin", daemon=True)
-    spinner.start()
+def tune(node: TunerNode, stop: Stop) -> int:
+    """Run the tuning; exit status 0 when it is finished or interrupted, 2 when it fails."""
+    stop.calls(node.interrupt)
     status = 0
     try:
-        if node.autostart:
-            autostart(node)
         node.run()
     except InterruptedTuningError as error:
         node.report("interrupted", str(error))
@@ -305,18 +277,10 @@ def _serve(node: TunerNode) -> int:
         node.report("failed", str(error))
         status = FAILURE
     if node.stay:
-        stopped.wait()
-    ended.set()
-    spinner.join()
-    if node.activated.is_set():
-        node.evaluator.close()
-    end_within(LEAVE_TIMEOUT, status)
-    node.destroy_node()
+        stop.wait()
     return status
 
 
-def _spin(node: TunerNode, ended: threading.Event) -> None:
-    executor = executor_for(node)
-    while not ended.is_set():
-        executor.spin_once(timeout_sec=POLL)
-    executor.remove_node(node)
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run_node(TunerNode, sys.argv if args is None else args, tune)
