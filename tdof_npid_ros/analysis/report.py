@@ -13,10 +13,12 @@ from typing import Any
 from tdof_npid_ros.analysis import page, picture
 from tdof_npid_ros.analysis.effort import Deviation, EffortUse, deviation, effort_use
 from tdof_npid_ros.analysis.episodes import Episode, bag_names, episodes_in
+from tdof_npid_ros.analysis.loop_margins import episode_margins
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
+from tdof_npid_ros.stability.margins import Margins
 
 LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
 # Column of the table and of the CSV: title, and how a person reads a value.
@@ -38,6 +40,7 @@ COLUMNS = {
     "effort_peak": ("max|u|", "{:.4g}"),
     "saturated_percent": ("at limit (%)", "{:.1f}"),
     "deviation": ("off simulation", "{:.3g}"),
+    "m_s": ("M_s", "{:.2f}"),
 }
 
 
@@ -49,12 +52,14 @@ class EpisodeReport:
         responses: by lane, in order of time.
         effort: by lane.
         deviation: from the in-process simulation.
+        margins: of the loop, by lane; None where plant or gains are not known.
     """
 
     episode: Episode
     responses: tuple[tuple[Response, ...], ...]
     effort: tuple[EffortUse, ...]
     deviation: Deviation
+    margins: tuple[Margins | None, ...]
 
     def metrics(self, lane: int = 0) -> SetpointMetrics | DisturbanceMetrics | None:
         """The paper's metrics of the lane's first response."""
@@ -187,6 +192,7 @@ def _report(episode: Episode) -> EpisodeReport:
         tuple(tuple(responses(episode.lane(lane))) for lane in lanes),
         tuple(effort_use(episode, lane) for lane in lanes),
         deviation(episode),
+        episode_margins(episode),
     )
 
 
@@ -200,6 +206,9 @@ def _causes(report: EpisodeReport) -> Iterator[tuple[str, int | None]]:
             if response.reason and (response.kind != "tracking" or response.iae is None):
                 hint = f"; {episode.hint}" if response.reason == NO_SETPOINT and episode.hint else ""
                 yield f"response to {response.kind}: {response.reason}{hint}", lane
+    for lane, loop in enumerate(report.margins[:LANES_SHOWN]):
+        if loop is not None and loop.reason:
+            yield f"no margins: {loop.reason}", lane
     if report.deviation.reason and episode.plan is not None:
         yield f"not compared with the simulation: {report.deviation.reason}", None
 
@@ -221,6 +230,8 @@ def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:
                 values["saturated_percent"] = 100.0 * use.saturated_share
             if off.output is not None and off.control_effort is not None:
                 values["deviation"] = max(off.output, off.control_effort)
+            loop = report.margins[lane]
+            values["m_s"] = loop.m_s if loop is not None else None
             rows.append(values)
     return rows
 
@@ -248,8 +259,11 @@ def _as_json(report: EpisodeReport, iae_changes: Iterator[float | None]) -> dict
                 "joint": joint,
                 "responses": [_response_as_json(response, next(iae_changes)) for response in found],
                 "effort": asdict(use),
+                "margins": loop.as_dict() if loop is not None else None,
             }
-            for joint, found, use in zip(episode.joints, report.responses, report.effort, strict=True)
+            for joint, found, use, loop in zip(
+                episode.joints, report.responses, report.effort, report.margins, strict=True
+            )
         ],
         "notes": list(episode.notes),
         "deviation": asdict(report.deviation),
