@@ -1,4 +1,4 @@
-"""`simulate` and `analyze` of the recorded run agree on every metric, in every case."""
+"""`simulate` and `analyze` of the recorded run agree on every metric and on the margins, in every case."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from loop_bags import LoopBag
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.parameter_file import config_folder
+from tdof_npid_ros.stability.margins import margins
 
 SHIPPED = sorted(path.stem for path in config_folder().glob("*.yaml"))
 TANKS = """
@@ -71,6 +72,12 @@ def agree(case: Case, folder: Path) -> None:
     assert [r.kind for r in (*setpoint.responses[0], *disturbance.responses[0])] == ["setpoint", "disturbance"]
     assert setpoint.metrics() == case.setpoint_response()
     assert disturbance.metrics() == case.disturbance_response()
+    told = setpoint.margins[0]
+    assert told is not None
+    if case.options.is_plain:
+        assert told == margins(case, case.gains)
+    else:
+        assert told.stable is None and "options" in str(told.reason)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
