@@ -31,6 +31,7 @@ from tdof_npid_ros.stability.plant import loop_plant
 LONG = bool(os.environ.get("TDOF_NPID_LONG"))
 LOOPS = 1000 if LONG else 60
 STARTS = 200 if LONG else 6
+pytestmark = pytest.mark.timeout(3600 if LONG else 120)
 MOST_DELAY = 80  # samples: of random loops, for the eigenvalues' sake
 LINEAR_ROWS = [row for row in ROWS if row.case != "sprott"]
 NAMES = [f"{row.case}-{row.controller}" for row in LINEAR_ROWS]
@@ -228,7 +229,6 @@ def dense_grid_passes(loop: Loop) -> bool:
     return bool(np.min(1 + re_g(loop, omega)) > 0)
 
 
-@pytest.mark.timeout(3600)
 def test_of_random_loops_no_unstable_one_is_certified_and_those_that_pass_are() -> None:
     passed = certified = close = 0
     for loop, factor in random_loops():

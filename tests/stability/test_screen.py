@@ -17,7 +17,9 @@ from tdof_npid_ros.stability.plant import loop_plant
 from tdof_npid_ros.stability.pulse import pulse_transfer
 from tdof_npid_ros.stability.screen import MOST_POINTS, Screen
 
-LOOPS = 1000 if os.environ.get("TDOF_NPID_LONG") else 120
+LONG = bool(os.environ.get("TDOF_NPID_LONG"))
+LOOPS = 1000 if LONG else 80
+pytestmark = pytest.mark.timeout(3600 if LONG else 120)
 MOST_DELAY = 300  # samples: of what is compared with eigenvalues
 
 
