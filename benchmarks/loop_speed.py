@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.harness import Rate, Result, Table, Verdict, main, plural, rate, summary
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.control.law import coefficients, limits_of
+from tdof_npid_ros.control.law import coefficients, conditional_integration, limits_of
 from tdof_npid_ros.loop import integrals, simulate
 from tdof_npid_ros.scenario import SampledPlan, parse_plan
 
@@ -189,7 +189,7 @@ def _c(case: Case, steps: int, repeats: int, lanes: int = 1) -> dict[str, Rate]:
     numbers = [
         signals.steps, C_RUNS, case.plans["setpoint"].end_ns // case.sample_period_ns, plant.delay,
         *np.ravel(plant.phi),
-        *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits, *UNLIMITED,
+        *plant.gamma_old, *plant.gamma_new, *c[:, 0], *limits, conditional_integration(case.gains), *UNLIMITED,
     ]  # fmt: skip
     given = " ".join(repr(float(number)) for number in numbers)
     expected = integrals(case.plant_at, case.gains, signals, UNLIMITED).iae[0] / case.sample_period

@@ -19,7 +19,16 @@ import numpy as np
 from tdof_npid_ros.compiled import compiled, entry_point
 from tdof_npid_ros.control.controller import Controller, rest_setpoint
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
-from tdof_npid_ros.control.law import COEFFICIENTS, Limits, coefficients, lane_coefficients, law, limits_of, settled
+from tdof_npid_ros.control.law import (
+    COEFFICIENTS,
+    Limits,
+    coefficients,
+    conditional_integration,
+    lane_coefficients,
+    law,
+    limits_of,
+    settled,
+)
 from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
@@ -150,12 +159,10 @@ def _run(
     c = coefficients(gains, signals.sample_period_ns / 1e9)
     iae, finite, early, late, largest = np.zeros((5, gains.lanes))
     for block in _blocks(gains):
-        gain_limits = limits_of(gains, block.start)
+        bounds = limits_of(gains, block.start), conditional_integration(gains), limits
         width = _width(block.stop - block.start)
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
-        lane_rows, sums = _run_block_of(
-            plant_at, gains, _padded(c[:, block], width), gain_limits, signals, limits, y, u
-        )
+        lane_rows, sums = _run_block_of(plant_at, gains, _padded(c[:, block], width), bounds, signals, y, u)
         iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
         if signals.rest is not None:
             before, half, whole = (sums[k][: block.stop - block.start] for k in (*signals.rest, steps + 1))
@@ -188,9 +195,8 @@ def _run_block_of(
     plant_at: PlantAt,
     gains: Gains,
     c: np.ndarray,
-    gain_limits: Limits,
+    bounds: _Bounds,
     signals: SampledPlan,
-    limits: tuple[float, float],
     y: np.ndarray,
     u: np.ndarray,
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
@@ -201,7 +207,7 @@ def _run_block_of(
         its late half does, and at the end.
     """
     width = c.shape[1]
-    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, limits)
+    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, bounds[2])
     initial = plant.initial_state
     rows = _aligned_zeros(_X + len(initial), width)
     rows[:COEFFICIENTS] = c
@@ -211,6 +217,8 @@ def _run_block_of(
         rows[_U_I : _Z + 1] = settled(c, gains, rest, y_0, u_0)
     ring: np.ndarray | None = None
     sums = {}
+    inputs = signals.setpoint, signals.disturbance, signals.weight
+    outputs = y.ravel(), u.ravel()
     for segment in _with_rest_apart(signals):
         sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
@@ -218,8 +226,8 @@ def _run_block_of(
             ring += plant.initial_effort
         check_same_delay(sampled, len(ring))
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
-        arguments = (sampled, initial, signals.setpoint, signals.disturbance, signals.weight, segment.first, last,
-                     gain_limits, limits, rows.ravel(), ring.ravel(), y.ravel(), u.ravel())  # fmt: skip
+        memory = rows.ravel(), ring.ravel()
+        arguments = (sampled, initial, inputs, (segment.first, last), bounds, memory, outputs)
         if width == 1:
             kernel_for(sampled, _run_lane)(*arguments)
         else:
@@ -247,31 +255,32 @@ def _aligned_zeros(rows: int, width: int) -> np.ndarray:
     return flat[first : first + rows * width].reshape(rows, width)
 
 
+# What the compiled drivers are given, in plain tuples (see `control/law.py`); arrays of lanes are flat.
+_Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # setpoint, disturbance and weight of the error, each (steps + 1,)
+_Stretch = tuple[int, int]  # the first step, and the one after the last
+_Bounds = tuple[Limits, float, tuple[float, float]]  # the law's limits and anti-windup, the actuator's limits
+_Memory = tuple[np.ndarray, np.ndarray]  # the lanes' rows, and the efforts on their way through the dead time
+_Outputs = tuple[np.ndarray, np.ndarray]  # y and u, empty if they are not asked for
+
+
 @compiled
-def answered(plant: Any, x: Any, u_i: Any, z: Any, c: Any, gain_limits: Any, limits: Any, r: Any, d: Any) -> Any:
+def answered(plant: Any, x: Any, u_i: float, z: float, c: Any, bounds: _Bounds, r: float, d: float) -> Any:
     """The first half of a step of one lane: y, u and the plant's input v, then the controller's state after it."""
     y = plant_output(plant, x)
-    u, u_i, z, _, _, _, _ = law(c, gain_limits, r, y, u_i, z)
-    return y, u, plant_input(plant, applied(u, limits), d), u_i, z
+    limits, conditional, actuator = bounds
+    u, u_i, z, _, _, _, _ = law(c, limits, conditional, r, y, u_i, z)
+    return y, u, plant_input(plant, applied(u, actuator), d), u_i, z
 
 
 @entry_point
 def _run_lane(
-    plant: Any,
-    x: Any,
-    setpoint: Any,
-    disturbance: Any,
-    weight: Any,
-    first: Any,
-    last: Any,
-    gain_limits: Any,
-    limits: Any,
-    rows: Any,
-    ring: Any,
-    y_out: Any,
-    u_out: Any,
-) -> Any:
-    """Steps first to last - 1 of one lane; arrays are flat."""
+    plant: Any, x: Any, inputs: _Inputs, stretch: _Stretch, bounds: _Bounds, memory: _Memory, outputs: _Outputs
+) -> None:
+    """Run one lane through a stretch."""
+    setpoint, disturbance, weight = inputs
+    first, last = stretch
+    rows, ring = memory
+    y_out, u_out = outputs
     size = np.uint64(plant.delay + 2)
     new = np.uint64(first) % size
     c = lane_coefficients(rows, 0, 1)
@@ -281,7 +290,7 @@ def _run_lane(
         r, d = setpoint[k], disturbance[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        y, u, v, u_i, z = answered(plant, x, u_i, z, c, gain_limits, limits, r, d)
+        y, u, v, u_i, z = answered(plant, x, u_i, z, c, bounds, r, d)
         ring[new] = v
         x = advance_bounded(plant, x, ring[oldest], v if plant.delay == 0 else ring[due], d)
         error = abs(r - y)
@@ -302,24 +311,22 @@ def _run_lane(
 def _run_block(
     plant: Any,
     x: Any,
-    setpoint: Any,
-    disturbance: Any,
-    weight: Any,
-    first: Any,
-    last: Any,
-    gain_limits: Any,
-    limits: Any,
-    rows: Any,
-    ring: Any,
-    y_out: Any,
-    u_out: Any,
-    lanes: Any,
-) -> Any:
-    """Steps first to last - 1 of a block of lanes side by side; arrays are flat, their rows as long as `lanes`.
+    inputs: _Inputs,
+    stretch: _Stretch,
+    bounds: _Bounds,
+    memory: _Memory,
+    outputs: _Outputs,
+    lanes: tuple[int, ...],
+) -> None:
+    """Run a block of lanes side by side through a stretch; rows are as long as `lanes`.
 
     For the compiler to vectorise, it must see that lanes do not overlap in memory. So the width is the length of a
     tuple, which is part of its type, and the loop over the lanes touches one array only.
     """
+    setpoint, disturbance, weight = inputs
+    first, last = stretch
+    rows, ring = memory
+    y_out, u_out = outputs
     w = len(lanes)
     size = np.uint64(plant.delay + 2)
     new = np.uint64(first) % size
@@ -334,7 +341,7 @@ def _run_block(
             x = loaded(x, rows, _X * w + j, w)
             c = lane_coefficients(rows, j, w)
             y, u, v, rows[_U_I * w + j], rows[_Z * w + j] = answered(
-                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, gain_limits, limits, r, d
+                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, bounds, r, d
             )
             v_due = v if plant.delay == 0 else rows[_V_DUE * w + j]
             x = advance_bounded(plant, x, rows[_V_OLD * w + j], v_due, d)

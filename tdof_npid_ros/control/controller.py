@@ -22,6 +22,7 @@ from tdof_npid_ros.control.law import (
     answer_lanes,
     any_at_limit,
     coefficients,
+    conditional_integration,
     limits_of,
     settled,
 )
@@ -240,6 +241,7 @@ class _Law:
     def __init__(self, gains: Gains, options: ControllerOptions, sample_period_ns: int) -> None:
         self.gains, self.options = gains, options
         self.c, self._limits = coefficients(gains, sample_period_ns / 1e9), limits_of(gains)
+        self._conditional = conditional_integration(gains)
         self.shape = shape_of(options, sample_period_ns / 1e9)
         self._flat = self.c.ravel()
         lanes = gains.lanes
@@ -260,12 +262,23 @@ class _Law:
     ) -> None:
         """One answer; state and shaping advance, effort and terms are written."""
         if self._is_plain:
-            answer_lanes(self._flat, self._limits, self._low, self._high, setpoint, output, state, effort, terms)
+            answer_lanes(
+                self._flat,
+                self._limits,
+                self._conditional,
+                self._low,
+                self._high,
+                setpoint,
+                output,
+                state,
+                effort,
+                terms,
+            )
             return
         shape_lanes(self.shape, setpoint, output, self.least, self.most, shaping, self._shaped, self._low, self._high)
         integral = state[INTEGRAL].copy()
         r, y = self._shaped
-        answer_lanes(self._flat, self._limits, self._low, self._high, r, y, state, effort, terms)
+        answer_lanes(self._flat, self._limits, self._conditional, self._low, self._high, r, y, state, effort, terms)
         if self.options.manual:
             state[INTEGRAL] = integral  # the law's is set when it takes over again
             np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)

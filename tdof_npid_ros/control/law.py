@@ -17,18 +17,21 @@ from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
 # Rows of the coefficient array (COEFFICIENTS, lanes) that the compiled law reads.
 (KP, KI_H, KD_H, PHI, ALPHA, BETA, HALF_INVERSE_SIGMA2, TRACKING) = range(8)
 COEFFICIENTS = 8
-Limits = tuple[float, float, float, float, float]  # u_min, u_max, u_i's min and max, 1.0 for conditional integration
+
+
+# Arguments of compiled functions come in plain tuples: to hand over a named one takes a microsecond.
+Limits = tuple[float, float, float, float]  # of one lane: of the effort, min and max, and of the integral action
 
 
 @compiled
-def law(c: Any, limits: Any, r: Any, y: Any, u_i: Any, z: Any) -> Any:
+def law(c: Any, limits: Limits, conditional: float, r: float, y: float, u_i: float, z: float) -> Any:
     """One sample of the TDOF-NPID law. Returns u, u_i and z for the next sample, u before its limits, ζ, u_p, u_d.
 
-    Args: the coefficients of one lane (see `coefficients`) and its limits (see `limits_of`), r setpoint, y output,
-    u_i integral action, z derivative filter's state.
+    Args: the coefficients of one lane (see `coefficients`), its limits (see `limits_of`), the anti-windup (see
+    `conditional_integration`), r setpoint, y output, u_i integral action, z derivative filter's state.
     """
     kp, ki_h, kd_h, phi, alpha, beta, q, tracking = c
-    u_min, u_max, i_min, i_max, conditional = limits
+    u_min, u_max, i_min, i_max = limits
     e = r - y
     zeta = exp_minus(e * e * q) * e  # (3), (4)
     u_p = kp * ((1.0 - alpha) * r - y)  # (7)
@@ -57,6 +60,7 @@ def lane_coefficients(c: Any, j: Any, lanes: Any) -> Any:
 def answer_lanes(
     c: np.ndarray,
     limits: Limits,
+    conditional: float,
     low: np.ndarray,
     high: np.ndarray,
     r: np.ndarray,
@@ -69,6 +73,7 @@ def answer_lanes(
 
     Args:
         c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `limits_of`.
+        conditional: see `conditional_integration`.
         low, high: limits of the effort at this sample, in place of those in `limits`, (lanes,).
         r, y: setpoint and output, (lanes,).
         state: integral action and derivative filter's state, (2, lanes); advanced in place.
@@ -76,11 +81,17 @@ def answer_lanes(
         terms: error, scaled error, proportional, integral, derivative and unlimited effort, (6, lanes); written.
     """
     lanes = y.shape[0]
-    _, _, i_min, i_max, conditional = limits
+    _, _, i_min, i_max = limits
     for j in range(lanes):
         u_i = state[0, j]
         u[j], state[0, j], state[1, j], raw, zeta, u_p, u_d = law(
-            lane_coefficients(c, j, lanes), (low[j], high[j], i_min, i_max, conditional), r[j], y[j], u_i, state[1, j]
+            lane_coefficients(c, j, lanes),
+            (low[j], high[j], i_min, i_max),
+            conditional,
+            r[j],
+            y[j],
+            u_i,
+            state[1, j],
         )
         terms[0, j] = r[j] - y[j]
         terms[1, j] = zeta
@@ -142,7 +153,15 @@ def coefficients(gains: Gains, sample_period: float) -> np.ndarray:
 def limits_of(gains: Gains, lane: int = 0) -> Limits:
     """The limits of one lane, as the compiled law reads them."""
     low, high = (float(gains.per_lane(name)[lane]) for name in LIMITS_PER_LANE)
-    return low, high, gains.integral_min, gains.integral_max, float(gains.anti_windup == "conditional")
+    return low, high, gains.integral_min, gains.integral_max
+
+
+def conditional_integration(gains: Gains) -> float:
+    """1.0: while the effort is at a limit, the integral action makes no step that would wind it up; 0.0: it does.
+
+    Back-calculation is in the coefficients, for it depends on the sample period.
+    """
+    return float(gains.anti_windup == "conditional")
 
 
 def settled(c: np.ndarray, gains: Gains, r: np.ndarray, y: np.ndarray, applied: np.ndarray) -> np.ndarray:
