@@ -76,7 +76,7 @@ def random_record(seed: int, noise: float, kind: str | None = None, samples: int
     load = step * rng.uniform(0.2, 0.6) * rng.choice([-1.0, 1.0])
     limits = (-math.inf, math.inf)
     if rng.random() < 0.3:
-        limits = (-1.4 * step, 1.4 * step) if kind != "unstable" else (-6.0 * step, 6.0 * step)
+        limits = (-1.4 * step, 1.4 * step) if kind != "unstable" else (-12.0 * step, 12.0 * step)
     quantum = step / 20.0 if rng.random() < 0.3 else 0.0
     standard_deviation = noise * 1.0
     noises = standard_deviation * rng.standard_normal(samples)
