@@ -19,7 +19,9 @@ from tdof_npid_ros.parameter import Table
 from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
 from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
-from tdof_npid_ros.plants.plant import Plant, plant_at_start
+from tdof_npid_ros.plants.noise import largest_noise, noiseless
+from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.responses import largest_step
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
@@ -60,8 +62,13 @@ class Case:
 
     @cached_property
     def plant(self) -> Plant:
-        """The plant as configured."""
-        return self.plant_at({})
+        """The plant as configured, without the noise of what is measured."""
+        return noiseless(self.plant_at({}))
+
+    @property
+    def noise_bound(self) -> float:
+        """How far a measured output is from the plant's at the most, in the output's unit."""
+        return largest_noise(self.plant_at({}))
 
     def plant_at(self, changes: Mapping[str, float]) -> Plant:
         """The plant with some parameters changed."""
@@ -142,7 +149,7 @@ class Case:
             PlanError, GainsError: there is no such response; the message says why.
         """
         y, setpoint, _ = self._response("disturbance", gains)
-        if not np.isclose(setpoint, y[0]):
+        if not np.isclose(setpoint, y[0], atol=1e-8 + self.noise_bound):
             raise _no_single_step(
                 self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
             )

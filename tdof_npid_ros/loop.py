@@ -32,8 +32,10 @@ from tdof_npid_ros.control.law import (
 from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
-from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
+from tdof_npid_ros.plants.noise import first_measured
+from tdof_npid_ros.plants.plant import PlantAt
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.plants.states import loaded, store
 from tdof_npid_ros.scenario import SampledPlan, Segment
 
@@ -122,7 +124,7 @@ def simulate_operated(
     period_ns, lanes = signals.sample_period_ns, gains.lanes
     controller = Controller(gains, period_ns, options)
     simulator = PlantSimulator(
-        plant_at_start(plant_at, signals.start, signals.segments[0].plant, effort_limits),
+        plant_at_start(plant_at, signals.start, signals.segments[0].plant, effort_limits, signals.identity),
         period_ns,
         lanes,
         effort_limits,
@@ -207,12 +209,12 @@ def _run_block_of(
         its late half does, and at the end.
     """
     width = c.shape[1]
-    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, bounds[2])
+    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, bounds[2], signals.identity)
     initial = plant.initial_state
     rows = _aligned_zeros(_X + len(initial), width)
     rows[:COEFFICIENTS] = c
     rows[_X:] = np.reshape(initial, (-1, 1))
-    y_0, u_0 = np.full(width, plant.initial_output), np.full(width, plant.initial_effort)
+    y_0, u_0 = np.full(width, first_measured(plant)), np.full(width, plant.initial_effort)
     if (rest := rest_setpoint(signals.start, y_0, u_0)) is not None:
         rows[_U_I : _Z + 1] = settled(c, gains, rest, y_0, u_0)
     ring: np.ndarray | None = None

@@ -270,6 +270,18 @@ SUBSTEPS: Final = Parameter(
     is_whole=True,
     fixed=True,
 )
+NOISE: Final = table(  # of what is measured
+    Parameter(
+        "noise", 0.0, "standard deviation of the noise in the output", "the output's unit", Range(0.0, 1e50), fixed=True
+    ),
+    Parameter(
+        "quantum", 0.0, "the output comes in multiples of it, after the noise; 0: as it is", "the output's unit",
+        Range(0.0, 1e50), fixed=True,
+    ),
+    Parameter(
+        "noise_seed", 0, "the same seed and the same plan have the same noise", within=Range(0, 2**31 - 1), fixed=True
+    ),
+)  # fmt: skip
 PLANT: Final = table(
     SAMPLE_PERIOD,
     MODE,
@@ -288,6 +300,7 @@ PLANT: Final = table(
     ),
     Parameter("effort_min", -math.inf, "lower limit of the actuator", "the effort's unit", of_loop=True),
     Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit", of_loop=True),
+    *NOISE.values(),
     Parameter(
         "reply_timeout",
         0.5,

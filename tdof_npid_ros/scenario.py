@@ -75,6 +75,7 @@ class SampledPlan:
     disturbance: np.ndarray
     segments: tuple[Segment, ...]
     start: float | None = None  # the output at which everything is settled at time 0; None: the plant's own start
+    identity: int = 0  # the plan's digest as a number below 2**48: what the noise of a simulated plant goes by
 
     @property
     def steps(self) -> int:
@@ -202,7 +203,8 @@ class Plan:
         samples = np.diff(first, append=steps + 1)
         none = np.zeros(len(first))
         setpoint, disturbance = (np.repeat(column.get(name, none), samples) for name in SIGNALS)
-        return SampledPlan(sample_period_ns, setpoint, disturbance, self._segments(column, first, steps), self.start)
+        segments = self._segments(column, first, steps)
+        return SampledPlan(sample_period_ns, setpoint, disturbance, segments, self.start, int(self.digest, 16))
 
     def _segments(self, column: Mapping[str, np.ndarray], first: np.ndarray, steps: int) -> tuple[Segment, ...]:
         """The stretches of constant plant parameters; `first` is each point's first sample."""

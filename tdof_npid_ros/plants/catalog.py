@@ -8,8 +8,9 @@ from typing import Any
 
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameter import Parameter, ParameterError, check_limits
-from tdof_npid_ros.parameters import MODELS, OFFSETS, PLANT
+from tdof_npid_ros.parameters import MODELS, NOISE, OFFSETS, PLANT
 from tdof_npid_ros.plants.linear import TransferFunction
+from tdof_npid_ros.plants.noise import NoisyPlant
 from tdof_npid_ros.plants.ode import Ode, Sprott, class_table, load_class, loaded_class
 from tdof_npid_ros.plants.plant import Plant, PlantError
 
@@ -80,11 +81,20 @@ def effort_limits(values: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
-    """The plant of a model; parameters that are not given keep their defaults, others in `values` are passed over.
+    """The plant of a model, with noise where it has any; what is not given keeps its default, others are passed over.
 
     Raises:
         PlantError: no such model, or a parameter of the wrong type or range.
     """
+    plant = _make_plant(model, values)
+    try:
+        noise, quantum, seed = (one.checked(values.get(name, one.default)) for name, one in NOISE.items())
+    except ParameterError as error:
+        raise PlantError(str(error)) from None
+    return NoisyPlant(plant, noise, quantum, seed) if noise or quantum else plant
+
+
+def _make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     its = model_table(model).items()
     try:
         p = {name: parameter.checked(values.get(name, parameter.default)) for name, parameter in its}

@@ -10,11 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import types
 
 from tdof_npid_ros.compiled import compiled, implementation_of, uncached
 from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.plants.states import along, linear_map, runge_kutta_mean
+
+_ALL_WHOLE = 2.0**51  # floats from here on have no room for a fraction worth rounding
+_ROUND = 1.5 * 2.0**52  # adding it and taking it away rounds to a whole number
 
 
 class SampledLinear(NamedTuple):
@@ -57,9 +61,20 @@ class SampledOde(NamedTuple):
     delay: int
 
 
+class SampledNoisy(NamedTuple):
+    """A plant whose output bears noise; its state is the plant's, then the step and the episode (`plants.noise`)."""
+
+    plant: Any
+    noise: float
+    quantum: float
+    seed: float
+    delay: int
+
+
 def kernel_for(plant: Any, entry: Any) -> Any:
     """The entry point to call with a plant: as it is, or uncached for a user's own plant."""
-    return uncached(entry) if isinstance(plant, SampledOde) else entry
+    inner = plant.plant if isinstance(plant, SampledNoisy) else plant
+    return uncached(entry) if isinstance(inner, SampledOde) else entry
 
 
 def check_same_delay(plant: Any, slots: int) -> None:
@@ -89,6 +104,44 @@ def plant_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
 
 
 @compiled
+def _mixed(z: Any) -> Any:
+    """The finaliser of SplitMix64: each bit of the result depends on all of z."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled
+def _sum_of_quarters(z: Any) -> Any:
+    """The sum of the four numbers of 16 bits in z."""
+    low, next_, high = np.uint64(0xFFFF), np.uint64(16), np.uint64(32)
+    return (z & low) + ((z >> next_) & low) + ((z >> high) & low) + (z >> np.uint64(48))
+
+
+@compiled
+def standard_noise(seed: Any, episode: Any, step: Any) -> Any:
+    """Nearly normal noise of mean 0 and deviation 1: the sum of twelve uniform numbers; the arguments are whole."""
+    golden = np.uint64(0x9E3779B97F4A7C15)
+    key = _mixed(_mixed(np.uint64(seed) + golden) ^ np.uint64(episode))
+    first = key + np.uint64(3) * np.uint64(step) * golden
+    total = _sum_of_quarters(_mixed(first + golden))
+    total += _sum_of_quarters(_mixed(first + np.uint64(2) * golden))
+    total += _sum_of_quarters(_mixed(first + np.uint64(3) * golden))
+    return (np.float64(np.int64(total)) - 393210.0) * (1.0 / 65536.0)
+
+
+@compiled
+def measured(y: Any, noise: Any, quantum: Any, seed: Any, step: Any, episode: Any) -> Any:
+    """An output as it is measured: with noise, then rounded to a quantum, to even where it lies between two."""
+    y = y + noise * standard_noise(seed, episode, step)
+    if quantum > 0.0:
+        quanta = y / quantum
+        if abs(quanta) < _ALL_WHOLE:
+            y = ((quanta + _ROUND) - _ROUND) * quantum
+    return y
+
+
+@compiled
 def runge_kutta(plant: Any, x: Any, u: Any, d: Any, step: Any) -> Any:
     """One step of the classical fourth-order Runge-Kutta method with u and d held."""
     k1 = plant_derivative(plant, x, u, d)
@@ -104,6 +157,10 @@ def _is(plant: Any, kind: type) -> bool:
 
 @implementation_of(plant_output)
 def _plant_output(plant: Any, x: Any) -> Any:
+    if _is(plant, SampledNoisy):
+        return lambda plant, x: measured(
+            plant_output(plant.plant, x[:-2]), plant.noise, plant.quantum, plant.seed, x[-2], x[-1]
+        )
     if _is(plant, SampledOde):
         return lambda plant, x: plant.output(x, plant.parameters)
     return lambda plant, x: x[0]
@@ -111,6 +168,8 @@ def _plant_output(plant: Any, x: Any) -> Any:
 
 @implementation_of(plant_input)
 def _plant_input(plant: Any, u: Any, d: Any) -> Any:
+    if _is(plant, SampledNoisy):
+        return lambda plant, u, d: plant_input(plant.plant, u, d)
     if _is(plant, SampledLinear) or _is(plant, SampledOffset):
         return lambda plant, u, d: u + d
     return lambda plant, u, d: u
@@ -125,6 +184,12 @@ def _plant_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
 
 @implementation_of(plant_advance)
 def _plant_advance(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
+    if _is(plant, SampledNoisy):
+        return lambda plant, x, v_old, v_new, d: (
+            *plant_advance(plant.plant, x[:-2], v_old, v_new, d),
+            x[-2] + 1.0,
+            x[-1],
+        )
     if _is(plant, SampledLinear):
         return lambda plant, x, v_old, v_new, d: linear_map(
             plant.phi, x, plant.gamma_old, v_old, plant.gamma_new, v_new

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tdof_npid_ros.plants.plant import PlantAt, plant_at_start
+from tdof_npid_ros.plants.plant import PlantAt
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
@@ -22,8 +23,8 @@ class Episode:
     def __init__(self, plan: Plan, simulator: PlantSimulator, plant_at: PlantAt, label: EpisodeLabel) -> None:
         plant_at(plan.plant_changes(0))  # its names first: to sample a plan takes memory
         signals = plan.sampled(simulator.sample_period_ns)
-        if plan.start is not None:
-            simulator.reset(plant_at_start(plant_at, plan.start, signals.segments[0].plant, simulator.effort_limits))
+        limits = simulator.effort_limits
+        simulator.reset(plant_at_start(plant_at, plan.start, signals.segments[0].plant, limits, signals.identity))
         self.label = label
         self.steps = signals.steps
         self.stamp_ns = 0

@@ -44,31 +44,6 @@ class Plant(Protocol):
 PlantAt = Callable[[dict[str, float]], Plant]  # the plant with some parameters changed
 
 
-def plant_at_start(
-    plant_at: PlantAt, start: float | None, parameters: dict[str, float], effort_limits: tuple[float, float]
-) -> Plant:
-    """The plant with which an episode begins: as configured, or at rest where the plan starts.
-
-    Args:
-        start: the output at rest; None: the plan does not say.
-        parameters: of the plant, as the plan has them at its start.
-        effort_limits: the actuator's.
-
-    Raises:
-        PlantError: nothing holds it there, or not within the effort's limits.
-    """
-    if start is None:
-        return plant_at({})
-    plant = plant_at(parameters).at_rest(start)
-    low, high = effort_limits
-    if not low <= plant.initial_effort <= high:
-        raise PlantError(
-            f"start {start:g}: the plant rests there with an effort of {plant.initial_effort:g}, "
-            f"beyond its limits {low:g} to {high:g}"
-        )
-    return plant
-
-
 def nanoseconds(seconds: float) -> int:
     """Seconds as the nearest whole number of nanoseconds."""
     return round(seconds * 1e9)

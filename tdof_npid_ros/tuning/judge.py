@@ -8,7 +8,7 @@ allowed. Without a linear model the same is told from the outputs alone.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -90,15 +90,22 @@ class Judge:
         constraints: none but without a screen.
         lengths: of the setpoint and the disturbance episode, in s.
         weight: w of the objective.
+        noise_bound: how far a measured output is from the plant's at the most, in its unit.
     """
 
     def __init__(
-        self, screen: Screen | None, constraints: Constraints, lengths: tuple[float, float], weight: float
+        self,
+        screen: Screen | None,
+        constraints: Constraints,
+        lengths: tuple[float, float],
+        weight: float,
+        noise_bound: float = 0.0,
     ) -> None:
         self._screen = screen
         self._constraints = constraints
         self._lengths = lengths
         self._weight = weight
+        self._noise_bound = noise_bound
 
     def __call__(self, gains: Gains, objective: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
         """The scores (n,) of candidates.
@@ -110,7 +117,7 @@ class Judge:
         """
         margins = self._screen(gains) if self._screen else None
         tails = [
-            tail(episode, length, gains, margins)
+            tail(self._without_noise(episode), length, gains, margins)
             for episode, length in zip((setpoint, disturbance), self._lengths, strict=True)
         ]
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -121,6 +128,12 @@ class Judge:
             violation = np.where(margins.stable, violation, UNSTABLE)
         lost = 2.0 - setpoint.finite_fraction - disturbance.finite_fraction
         return Scores(objective, np.where(lost > 0.0, DIVERGED + lost, violation))
+
+    def _without_noise(self, episode: Integrals) -> Integrals:
+        """What noise alone may explain is no tail."""
+        if not self._noise_bound:
+            return episode
+        return replace(episode, rest_error=np.maximum(episode.rest_error - self._noise_bound, 0.0))
 
 
 def tail(episode: Integrals, length: float, gains: Gains, margins: LaneMargins | None) -> Array:

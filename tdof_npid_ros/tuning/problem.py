@@ -175,7 +175,7 @@ class TuningProblem:
     def judge(self) -> Judge:
         """Of which candidates may win."""
         setpoint, disturbance = (self.case.signals[episode].steps * self.case.sample_period for episode in EPISODES)
-        return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight)
+        return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight, self.case.noise_bound)
 
     def at_bounds(self, gains: Gains) -> dict[str, str]:
         """The free gains that lie at a bound of the search: `lower` or `upper` by name."""

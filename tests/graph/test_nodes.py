@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,13 +31,15 @@ SHORT = {
 }
 
 
-def run_short(graph: Any, case: str, lanes: int = 1, **controller: Any) -> tuple[np.ndarray, np.ndarray]:
+def run_short(
+    graph: Any, case: str, lanes: int = 1, plant: Mapping[str, Any] = MappingProxyType({}), **controller: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """Run the short plan of a case; returns its outputs and efforts, (steps + 1, lanes)."""
     from sensor_msgs.msg import JointState
     from std_srvs.srv import Trigger
 
     outputs, efforts = graph.collect("output", JointState), graph.collect("control_effort", JointState)
-    graph.start("plant", case=case, lanes=lanes)
+    graph.start("plant", case=case, lanes=lanes, **plant)
     graph.start("controller", case=case, **controller)
     graph.start("scenario", case=case, episodes=["short"], plan__short=list(SHORT[case]))
     graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 60, "the end of the episode")

@@ -17,7 +17,7 @@ from tdof_npid_ros.graph.plant.realtime import RealtimePlant
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
-from tdof_npid_ros.parameters import PLANT, sample_period_in_ns
+from tdof_npid_ros.parameters import NOISE, PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import effort_limits, make_plant, model_table, named_model
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
@@ -64,7 +64,7 @@ class PlantNode(LoopEnd):
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
-        p = {**self.values_of([*self.model_names, "lanes", "effort_min", "effort_max"]), **changes}
+        p = {**self.values_of([*self.model_names, *NOISE, "lanes", "effort_min", "effort_max"]), **changes}
         make_plant(self.model, p)
         effort_limits(p)
         if self.joints.names and len(self.joints.names) != p["lanes"]:

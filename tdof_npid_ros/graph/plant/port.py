@@ -15,7 +15,9 @@ from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
 from tdof_npid_ros.graph.runtime.messages import lane_names
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
+from tdof_npid_ros.parameters import NOISE
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
+from tdof_npid_ros.plants.noise import in_episode
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
@@ -110,7 +112,7 @@ class PlantPort:
         Raises:
             PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
         """
-        values = self.node.values_of(self._model_names)
+        values = self.node.values_of([*self._model_names, *NOISE])
         changeable = changeable_parameters(self._model, values)
         for name in changes:
             if name not in changeable:
@@ -120,10 +122,10 @@ class PlantPort:
                 )
         return make_plant(self._model, {**values, **changes})
 
-    def new_simulator(self) -> PlantSimulator:
-        """The plant at its initial state, with the parameters as they are now."""
+    def new_simulator(self, episode: int = 0) -> PlantSimulator:
+        """The plant at its initial state, with the parameters as they are now and the noise of an episode."""
         lanes = self.node.values_of(["lanes"])["lanes"]
-        return PlantSimulator(self.plant_at({}), self.period_ns, lanes, self.effort_limits())
+        return PlantSimulator(in_episode(self.plant_at({}), episode), self.period_ns, lanes, self.effort_limits())
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""

@@ -34,7 +34,8 @@ class RealtimePlant:
     def reset(self) -> tuple[bool, str]:
         """Back to the initial state, at time 0."""
         port = self._port
-        port.begin(port.next_label(""), port.new_simulator())
+        label = port.next_label("")
+        port.begin(label, port.new_simulator(label.number))
         self._start()
         return True, "at the initial state, time 0"
 

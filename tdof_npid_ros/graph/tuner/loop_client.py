@@ -20,6 +20,7 @@ from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
 from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.names import in_namespace
+from tdof_npid_ros.parameters import NOISE
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.tuning.ask_tell import Array
@@ -200,6 +201,7 @@ def _plant_parameters(case: Case) -> dict[str, Any]:
     """What the plant's parameters must be for the loop to be the case's."""
     effort_min, effort_max = case.effort_limits
     model = {name: case.plant_values.get(name, value) for name, value in model_parameters(case.model).items()}
+    noise = {name: case.plant_values.get(name, one.default) for name, one in NOISE.items()}
     return {
         "mode": "lockstep",
         "model": case.model,
@@ -207,6 +209,7 @@ def _plant_parameters(case: Case) -> dict[str, Any]:
         "effort_min": effort_min,
         "effort_max": effort_max,
         **model,
+        **noise,
     }
 
 
