@@ -20,6 +20,7 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.parameters import sample_period_in_ns
 from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.noise import largest_noise
 from tdof_npid_ros.responses import Lane, largest_step
 from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError, parse_plan, read_episodes
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
@@ -317,7 +318,8 @@ def _is_start(view: _View, first_stamp_ns: int, plant: Mapping[str, object], out
     if view.label is None or view.label.plan:
         return first_stamp_ns == 0
     # Of a recording that begins within an episode, the first output is not the plant's initial one.
-    return not view.is_first or bool((output[0] == _initial_output(plant, output)).all())
+    off = np.abs(output[0] - _initial_output(plant, output))
+    return not view.is_first or bool((off <= _noise_bound(plant)).all())
 
 
 class _Sampling(NamedTuple):
@@ -412,6 +414,14 @@ def _initial_output(plant: Mapping[str, object], output: np.ndarray) -> float:
     except (KeyError, ValueError):
         known = output[~np.isnan(output)]
         return float(known[0]) if known.size else 0.0
+
+
+def _noise_bound(plant: Mapping[str, object]) -> float:
+    """How far its noise takes a plant's output at the most."""
+    try:
+        return largest_noise(make_plant(str(plant["model"]), plant))
+    except (KeyError, ValueError):
+        return 0.0
 
 
 def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np.ndarray:
