@@ -167,3 +167,35 @@ def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_actio
             answer = joint_state(stamp, controller.digest, [1.0], controller.effort, begun)
             bag.write("control_effort", JOINT_STATE, answer)
     assert verify.verify(tmp_path / "bag").equal == 300
+
+
+def test_a_realtime_loop_recorded_before_outputs_bore_labels_began_from_nothing_at_each_stamp_of_0(
+    tmp_path, case
+) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(300):
+            if k % 120 == 0:
+                controller.reset()
+            stamp, y = (k % 120) * case.sample_period_ns, np.array([np.cos(k / 30)])
+            controller.answer(stamp, np.ones(1), y)
+            bag.write("output", JOINT_STATE, joint_state(stamp, "", y, [0.5]))
+            bag.write("control_effort", JOINT_STATE, joint_state(stamp, controller.digest, [1.0], controller.effort))
+    assert verify.verify(tmp_path / "bag").equal == 300
+
+
+def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(300):
+            if k in (0, 120):
+                controller.reset()
+            stamp, label = k * case.sample_period_ns, f"-/a.{1 + (k >= 120)}"
+            y = np.array([np.cos(k / 30)])
+            controller.answer(stamp, np.ones(1), y)
+            bag.write("output", JOINT_STATE, joint_state(stamp, label, y, [0.0]))
+            answer = joint_state(stamp, f"{controller.digest} {label}", [1.0], controller.effort)
+            bag.write("control_effort", JOINT_STATE, answer)
+    assert verify.verify(tmp_path / "bag").equal == 300
