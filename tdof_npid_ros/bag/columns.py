@@ -287,7 +287,7 @@ class ColumnBuilder:
         self._columns = {path: _Gathered(expected) for path in self._paths}
         self._times: list[tuple[scan.Ints, scan.Ints]] = []
         self._sequence: list[scan.Ints] | None = [] if SEQUENCE in (fields or ()) else None
-        self._skipped_rows: list[int] = []
+        self._skipped_rows: list[scan.Ints] = []
         self._reason = ""
         self.count = 0
         self.size = 0
@@ -295,7 +295,8 @@ class ColumnBuilder:
     @property
     def skipped(self) -> Skipped | None:
         """What cannot be decoded."""
-        return Skipped(len(self._skipped_rows), self._reason) if self._skipped_rows else None
+        count = sum(rows.size for rows in self._skipped_rows)
+        return Skipped(count, self._reason) if count else None
 
     def add(self, table: scan.Table) -> None:
         """Decode the messages of a table."""
@@ -319,7 +320,7 @@ class ColumnBuilder:
         A publish time of 0 is none: the log time stands in its place.
         """
         columns: Columns = {}
-        skipped = np.array(sorted(self._skipped_rows), np.int64)
+        skipped = np.sort(np.concatenate([np.empty(0, np.int64), *self._skipped_rows]))
         log_time = _without(skipped, [times[0] for times in self._times])
         publish_time = _without(skipped, [times[1] for times in self._times])
         self._times.clear()
@@ -343,7 +344,7 @@ class ColumnBuilder:
 
     def _skip(self, rows: scan.Ints, reason: str = "") -> None:
         self._reason = self._reason or reason
-        self._skipped_rows.extend(rows.tolist())
+        self._skipped_rows.append(rows)
 
     def _add_rows(self, rows: scan.Ints, block: _Rows, size: int) -> None:
         for _ in range(_LAYOUT_TRIES):

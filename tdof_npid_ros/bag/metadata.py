@@ -11,6 +11,7 @@ from typing import Any, Final
 import yaml
 
 from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.bag.qos import qos_dicts
 from tdof_npid_ros.input_file import InputError, read_file
 from tdof_npid_ros.yaml_text import YamlTextError, load_yaml
 
@@ -18,47 +19,6 @@ FILE_NAME: Final = "metadata.yaml"
 VERSION: Final = 9
 
 _NO_START: Final = 2**63 - 1  # what rosbag2 writes for a bag without messages
-_FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
-
-
-@dataclass(frozen=True)
-class QosProfile:
-    """The quality of service that a publisher offers, in rosbag2's words. Deadline and lifespan are infinite."""
-
-    reliability: str = "reliable"  # reliable, best_effort
-    durability: str = "volatile"  # volatile, transient_local
-    history: str = "keep_last"  # keep_last, keep_all
-    depth: int = 10
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the profile as rosbag2 writes it."""
-        return {
-            "history": self.history,
-            "depth": self.depth,
-            "reliability": self.reliability,
-            "durability": self.durability,
-            "deadline": dict(_FOREVER),
-            "lifespan": dict(_FOREVER),
-            "liveliness": "automatic",
-            "liveliness_lease_duration": dict(_FOREVER),
-            "avoid_ros_namespace_conventions": False,
-        }
-
-
-def qos_text(profiles: Sequence[QosProfile]) -> str:
-    """Return QoS profiles as the YAML text that MCAP channels carry."""
-    if not profiles:
-        return ""
-    return yaml.safe_dump([profile.as_dict() for profile in profiles], sort_keys=False).strip()
-
-
-def _profiles(qos: str) -> list[Any]:
-    """Return the QoS profiles of a channel's text, none when it holds none that can be read."""
-    try:
-        profiles = load_yaml(qos)
-    except YamlTextError:
-        return []
-    return profiles if isinstance(profiles, list) else []
 
 
 @dataclass(frozen=True)
@@ -107,7 +67,7 @@ class BagMetadata:
                         "name": topic.name,
                         "type": topic.type,
                         "serialization_format": "cdr",
-                        "offered_qos_profiles": _profiles(topic.qos),
+                        "offered_qos_profiles": qos_dicts(topic.qos),
                         "type_description_hash": topic.type_hash,
                     },
                     "message_count": topic.count,
@@ -135,10 +95,8 @@ class BagMetadata:
 def write(folder: Path, metadata: BagMetadata) -> None:
     """Write `metadata.yaml`, whole or not at all.
 
-    Raises
-    ------
-    OSError
-        As the file system says.
+    Raises:
+        OSError: as the file system says.
     """
     partial = folder / f"{FILE_NAME}.tmp"
     with partial.open("w", encoding="utf-8") as file:
@@ -151,10 +109,8 @@ def write(folder: Path, metadata: BagMetadata) -> None:
 def read_information(folder: Path) -> dict[str, Any]:
     """Return what `metadata.yaml` says, empty when there is none or it was cut short by a crash.
 
-    Raises
-    ------
-    BagError
-        The file is no rosbag2 metadata or cannot be read.
+    Raises:
+        BagError: the file is no rosbag2 metadata or cannot be read.
     """
     path = folder / FILE_NAME
     try:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import heapq
-import re
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
 
-from tdof_npid_ros.bag import metadata
 from tdof_npid_ros.bag.cdr import decode_with
 from tdof_npid_ros.bag.columns import ColumnBuilder, Columns, Skipped
 from tdof_npid_ros.bag.definition import Definition
 from tdof_npid_ros.bag.errors import BagError, choices, shown
+from tdof_npid_ros.bag.folder import SQLITE, BagFolder
 from tdof_npid_ros.bag.mcap_file import McapFile
 from tdof_npid_ros.bag.scan import Table
 from tdof_npid_ros.bag.sqlite_file import SqliteFile
@@ -29,28 +30,8 @@ LAST_NS: Final = 2**63 - 1
 
 _MAX_OPEN_BYTES: Final = 1 << 30  # of pieces that overlap in time, read at once to put their messages in order
 _ROWS_AT_ONCE: Final = 1 << 14  # of a piece, as Python objects
-_SUFFIXES: Final = (".mcap", ".db3")
-
-
-def bag_files(path: Path) -> list[Path]:
-    """Return the files of a bag: of a folder the `.mcap` or `.db3` files in the order they were written.
-
-    Raises:
-        BagError: there is no bag at this path.
-    """
-    if path.is_file():
-        return [path]
-    try:
-        files = [file for file in path.iterdir() if file.suffix in _SUFFIXES and file.is_file()]
-    except OSError as error:
-        raise BagError(f"cannot open {path}: {error.strerror}: give a bag folder or a file") from None
-    if not files:
-        raise BagError(f"{path}: no .mcap or .db3 file in it: give a bag folder or a file")
-    return sorted(files, key=lambda file: [int(part) if part.isdigit() else part for part in _split_digits(file.name)])
-
-
-def _split_digits(name: str) -> list[str]:
-    return re.split(r"([0-9]+)", name)
+_FIRST_MESSAGES: Final = 1000  # among which one may lie far before the rest
+_LONG_BEFORE_NS: Final = 60 * 10**9
 
 
 class BagReader:
@@ -91,6 +72,20 @@ class BagReader:
         filled = [file for file in self._files if any(topic.count for topic in file.topics.values())]
         self.start_ns = min((file.start_ns for file in filled), default=0)
         self.end_ns = max((file.end_ns for file in filled), default=0)
+
+    @cached_property
+    def begin_ns(self) -> int:
+        """Log time with which the recording really begins, without first messages that lie far before all others.
+
+        Such bear the time 0, for example, as they came before the first `/clock`.
+        """
+        begin = before = self.start_ns
+        with suppress(BagError):  # of what is damaged one hears when it is read
+            for _, log_time, _, _ in islice(self.messages(), _FIRST_MESSAGES):
+                if log_time - before > max(_LONG_BEFORE_NS, self.end_ns - log_time):
+                    begin = log_time
+                before = log_time
+        return begin
 
     @cached_property
     def unreadable(self) -> dict[str, str]:
@@ -236,16 +231,11 @@ class BagReader:
         return decode_with(self._definition(topic), data)
 
     def _open(self, path: Path) -> None:
-        if path.is_dir():
-            information = metadata.read_information(path)
-            mode = information.get("compression_mode")
-            if mode and str(mode).upper() != "NONE":
-                raise BagError(f"{path}: is compressed by rosbag2 ({mode}): unpack it with `ros2 bag convert`")
-            custom = information.get("custom_data")
-            if isinstance(custom, dict):
-                self.custom_data.update({str(key): str(value) for key, value in custom.items()})
-        for name in bag_files(path):
-            file: Storage = SqliteFile(name) if name.suffix == ".db3" else McapFile(name)
+        bag = BagFolder.of(path)
+        self.custom_data.update(bag.custom_data)
+        self.missing.extend(bag.missing)
+        for name in bag.files:
+            file: Storage = SqliteFile(name) if name.suffix == SQLITE else McapFile(name)
             self._files.append(file)
             self.metadata.extend(file.metadata)
             self.missing.extend(file.missing)

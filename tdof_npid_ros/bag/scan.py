@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from tdof_npid_ros.compiled import compiled, entry_point
@@ -12,7 +13,7 @@ from tdof_npid_ros.compiled import compiled, entry_point
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
-_MESSAGE: Final = 0x05
+_MESSAGE: Final = int(Opcode.MESSAGE)
 _PREFIX_BYTES: Final = 9
 _FIELDS_BYTES: Final = 22
 
@@ -25,16 +26,15 @@ OTHER_RECORD: Final = 4  # no message (only `run_length` stops there)
 TOO_MANY: Final = 5  # records that are no messages
 
 
-def _uint64(data: Bytes, at: int) -> np.uint64:
+@compiled
+def _u64(data: Bytes, at: int) -> np.uint64:
     value = np.uint64(0)
     for index in range(8):
         value |= np.uint64(data[at + index]) << np.uint64(8 * index)
     return value
 
 
-_u64: Any = compiled(_uint64)
-
-
+@entry_point
 def _walk(data: Bytes, only_messages: bool) -> tuple[int, int, int, int]:
     position = 0
     messages = 0
@@ -59,9 +59,7 @@ def _walk(data: Bytes, only_messages: bool) -> tuple[int, int, int, int]:
     return position, messages, others, AT_END
 
 
-_walk_compiled = entry_point(_walk)
-
-
+@entry_point
 def _fill(
     data: Bytes,
     end: int,
@@ -102,9 +100,7 @@ def _fill(
     return -1
 
 
-_fill_compiled = entry_point(_fill)
-
-
+@entry_point
 def _copy_rows(data: Bytes, offset: Ints, size: int, rows: Bytes) -> None:
     width = rows.shape[1]
     for row in range(offset.size):
@@ -115,9 +111,6 @@ def _copy_rows(data: Bytes, offset: Ints, size: int, rows: Bytes) -> None:
             rows[row, 4 + index] = data[start + index]
         for index in range(4 + size, width):
             rows[row, index] = 0
-
-
-_copy_rows_compiled = entry_point(_copy_rows)
 
 
 class Table(NamedTuple):
@@ -150,7 +143,7 @@ class Walk(NamedTuple):
 
 def run_length(data: Bytes) -> tuple[int, int]:
     """Return how many bytes of whole message records `data` begins with, and why the run ends."""
-    position, _, _, stop = _walk_compiled(data, True)
+    position, _, _, stop = _walk(data, True)
     return position, stop
 
 
@@ -159,7 +152,7 @@ def walk(data: Bytes, most_others: int) -> Walk:
 
     None when more than `most_others` of them are no messages.
     """
-    position, messages, others, stop = _walk_compiled(data, False)
+    position, messages, others, stop = _walk(data, False)
     if others > most_others:
         position, messages, others, stop = 0, 0, 0, TOO_MANY
     table = Table(
@@ -169,7 +162,7 @@ def walk(data: Bytes, most_others: int) -> Walk:
         *(np.empty(messages, np.int64) for _ in range(4)),
     )
     other = np.empty(others, np.int64)
-    wrong = _fill_compiled(data, position, *table[1:], other)
+    wrong = _fill(data, position, *table[1:], other)
     if wrong >= 0:
         return Walk(table, other, wrong, WRONG_TIME)
     return Walk(table, other, position, stop)
@@ -178,11 +171,10 @@ def walk(data: Bytes, most_others: int) -> Walk:
 def gather(data: Bytes, offset: Ints, size: int) -> Bytes:
     """Copy messages of one size into rows whose fields are aligned.
 
-    Returns
-    -------
-    Array of shape (messages, width): four zero bytes, the message, and zeros to a multiple of eight, so that
-    the message's body, after its 4-byte head, begins at byte 8.
+    Returns:
+        Array of shape (messages, width): four zero bytes, the message, and zeros to a multiple of eight, so that
+        the message's body, after its 4-byte head, begins at byte 8.
     """
     rows = np.empty((offset.size, (4 + size + 7) // 8 * 8), np.uint8)
-    _copy_rows_compiled(data, offset, size, rows)
+    _copy_rows(data, offset, size, rows)
     return rows

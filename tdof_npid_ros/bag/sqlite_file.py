@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,10 +14,15 @@ from tdof_npid_ros.bag.decompress import MAX_CHUNK_BYTES
 from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.bag.scan import Table
 from tdof_npid_ros.bag.storage import Piece, TopicInfo
+from tdof_npid_ros.input_file import InputError, check_file
 
 _PIECE_MESSAGES: Final = 8192
+_PIECE_BYTES: Final = 8 << 20
 _NEEDED: Final = {"topics", "messages"}
 _READ: Final = {*_NEEDED, "message_definitions"}
+_SIZES: Final = "SELECT timestamp, id, length(data) FROM messages ORDER BY timestamp, id"
+_NEVER: Final = 2**63 - 1
+_Place = tuple[int, int]  # of a message: its time and its number
 _TABLES: Final = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
 
 
@@ -26,12 +30,10 @@ class SqliteFile:
     """An open `.db3` file: a `Storage`. Publish times are the log times, the only ones it holds."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file.
+        """Open the file, and nothing but the file: it is taken as it is, and nothing is written beside it.
 
-        Raises
-        ------
-        BagError
-            It cannot be read, or is no bag.
+        Raises:
+            BagError: it cannot be read, or is no bag.
         """
         self.path = path
         self.name = str(path)
@@ -39,10 +41,13 @@ class SqliteFile:
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.missing: list[str] = []
         self._names: dict[int, str] = {}
-        if not path.is_file():
-            raise BagError(f"cannot open {path}: no such file")
         try:
-            uri = f"{path.resolve().as_uri()}?mode=ro"
+            check_file(path)
+        except InputError as error:
+            raise BagError(f"cannot open a bag: {error}") from None
+        self._look_for_unfinished_work()
+        try:
+            uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
             self._database = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
         except sqlite3.Error as error:
             raise BagError(f"cannot open {path}: {error}") from None
@@ -60,13 +65,21 @@ class SqliteFile:
         return self._names
 
     def pieces(self) -> list[Piece]:
-        """Return the messages in pieces that do not overlap in time, so far as equal times allow."""
-        starts = [*self._starts, self.end_ns + 1]
-        return [Piece(start, end - 1, partial(self._load, start, end)) for start, end in pairwise(starts)]
+        """Return the messages in pieces of some megabytes, in the order of their times."""
+        return [Piece(start[0], end[0], partial(self._load, start, end)) for start, end in self._ranges]
 
     def close(self) -> None:
         """Close the file."""
         self._database.close()
+
+    def _look_for_unfinished_work(self) -> None:
+        for suffix in ("-wal", "-journal"):
+            beside = self.path.with_name(self.path.name + suffix)
+            if beside.exists() and beside.stat().st_size:
+                self.missing.append(
+                    f"{self.path}: {beside.name}, which a recorder has left beside it, is not read: put both together"
+                    f" with `sqlite3 {self.path.name} 'PRAGMA journal_mode = delete'`"
+                )
 
     def _query(self, query: str, arguments: Sequence[int] = ()) -> list[tuple[Any, ...]]:
         try:
@@ -126,25 +139,37 @@ class SqliteFile:
         return {name: (encoding, text) for name, encoding, text in self._query(query)}
 
     def _find_pieces(self) -> None:
+        """Find ranges of time and number that hold so much that it can be in memory at once."""
+        self._ranges: list[tuple[_Place, _Place]] = []
+        first = last = (-1, 0)
+        count = size = 0
         try:
-            rows = self._database.execute("SELECT timestamp FROM messages ORDER BY timestamp")
-            times = np.fromiter((row[0] for row in rows), np.int64)
-        except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
-            raise BagError(f"{self.path}: its times cannot be read ({error}): the file is damaged") from None
-        if times.size and (times[0] < 0 or times[-1] == 2**63 - 1):
-            raise BagError(f"{self.path}: a message's time is before 1970 or beyond 2262: the file is damaged")
-        self.start_ns = int(times[0]) if times.size else 0
-        self.end_ns = int(times[-1]) if times.size else 0
-        self._starts = np.unique(times[::_PIECE_MESSAGES]).tolist()
+            for time, number, length in self._database.execute(_SIZES):
+                if not (isinstance(time, int) and isinstance(number, int) and 0 <= time < _NEVER):
+                    raise BagError(f"{self.path}: a message's time is before 1970 or beyond 2262: the file is damaged")
+                if (time, number) <= last:
+                    raise BagError(f"{self.path}: two messages bear the number {number}: the file is damaged")
+                if count == _PIECE_MESSAGES or (count and size + length > _PIECE_BYTES):
+                    self._ranges.append((first, last))
+                    count = size = 0
+                last = (time, number)
+                first = first if count else last
+                count, size = count + 1, size + length
+        except (sqlite3.Error, TypeError, OverflowError, UnicodeDecodeError) as error:
+            raise BagError(f"{self.path}: its messages cannot be read ({error}): the file is damaged") from None
+        if count:
+            self._ranges.append((first, last))
+        self.start_ns = self._ranges[0][0][0] if self._ranges else 0
+        self.end_ns = self._ranges[-1][1][0] if self._ranges else 0
 
-    def _load(self, start: int, end: int) -> Table:
+    def _load(self, first: _Place, last: _Place) -> Table:
         query = (
-            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp < ?"
-            " ORDER BY timestamp, id"
+            "SELECT topic_id, timestamp, data FROM messages"
+            " WHERE (timestamp, id) >= (?, ?) AND (timestamp, id) <= (?, ?) ORDER BY timestamp, id"
         )
-        rows = self._query(query, (start, end))
+        rows = self._query(query, (*first, *last))
         if not all(isinstance(data, bytes) and isinstance(time, int) for _, time, data in rows):
-            raise BagError(f"{self.path}: a message at {start} ns or later is no bytes: the file is damaged")
+            raise BagError(f"{self.path}: a message at {first[0]} ns or later is no bytes: the file is damaged")
         length = np.array([len(data) for _, _, data in rows], np.int64)
         log_time = np.array([time for _, time, _ in rows], np.int64)
         return Table(

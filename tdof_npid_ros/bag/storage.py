@@ -9,6 +9,7 @@ from typing import Final, NamedTuple, Protocol
 from tdof_npid_ros.bag import schema
 from tdof_npid_ros.bag.definition import Definition, parse
 from tdof_npid_ros.bag.errors import BagError, shown
+from tdof_npid_ros.bag.qos import QosProfile, qos_profiles
 from tdof_npid_ros.bag.scan import Table
 
 ROS2MSG: Final = "ros2msg"
@@ -38,6 +39,11 @@ class TopicInfo:
     qos: str
     type_hash: str
     problem: str = ""
+
+    @property
+    def profiles(self) -> list[QosProfile]:
+        """The QoS profiles, whichever distribution wrote them."""
+        return qos_profiles(self.qos)
 
     def joined(self, other: TopicInfo) -> TopicInfo:
         """This topic with what another file, or another channel, holds of it."""

@@ -7,18 +7,28 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
-from tdof_npid_ros.bag import metadata, records, schema
+from mcap.records import Attachment, Channel, Schema
+
+from tdof_npid_ros.bag import metadata, schema
 from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.bag.file_writer import COMPRESSIONS, FileWriter
-from tdof_npid_ros.bag.metadata import QosProfile
+from tdof_npid_ros.bag.qos import QosProfile, qos_text
+from tdof_npid_ros.bag.storage import ROS2MSG
 
 CHUNK_BYTES: Final = 1 << 20  # a chunk is compressed and written when it holds this much
 FLUSH_INTERVAL_S: Final = 0.5  # so that a crash loses less than a second, the writing itself included
 
 _NEVER_NS: Final = 2**64
 _MAX_TOPICS: Final = 2**16 - 1  # MCAP counts channels in 16 bits, from 1 on
+
+
+class _Topic(NamedTuple):
+    """What is announced of a topic, in each file anew."""
+
+    type: str
+    channel: Channel
 
 
 class BagWriter:
@@ -28,12 +38,9 @@ class BagWriter:
     `flush_interval_s` of wall-clock time, and from there to the disk. What has gone to the disk stays
     readable whatever happens afterwards.
 
-    Attributes
-    ----------
-    folder
-        The bag.
-    custom_data
-        Text by key for `metadata.yaml`; may be changed until the bag is closed.
+    Attributes:
+        folder: the bag.
+        custom_data: text by key for `metadata.yaml`; may be changed until the bag is closed.
     """
 
     def __init__(
@@ -48,23 +55,15 @@ class BagWriter:
     ) -> None:
         """Create the folder, its first file and `metadata.yaml`.
 
-        Parameters
-        ----------
-        folder
-            Must not exist; its parents are created. Its name becomes the files' name.
-        compression
-            Of the chunks.
-        max_bytes
-            A new file begins when a file has reached this size; 0: never. Checked at each chunk.
-        max_duration_s
-            A new file begins when a message's log time lies this long after its file's first; 0: never.
-        flush_interval_s
-            Longest time that a message waits in memory.
+        Args:
+            folder: must not exist; its parents are created. Its name becomes the files' name.
+            compression: of the chunks.
+            max_bytes: a new file begins when a file has reached this size; 0: never. Checked at each chunk.
+            max_duration_s: a new file begins when a message's log time lies this long after its file's first; 0: never.
+            flush_interval_s: longest time that a message waits in memory.
 
-        Raises
-        ------
-        BagError
-            The folder exists or cannot be created, or an option makes no sense.
+        Raises:
+            BagError: the folder exists or cannot be created, or an option makes no sense.
         """
         if compression not in COMPRESSIONS:
             raise BagError(f"compression {compression!r} is unknown: choose one of {', '.join(COMPRESSIONS)}")
@@ -77,9 +76,8 @@ class BagWriter:
         self._max_duration_ns = round(max_duration_s * 1e9)
         self._chunk_bytes = min(CHUNK_BYTES, max_bytes) if max_bytes else CHUNK_BYTES
         self._split_at_ns = 0
-        self._schemas: dict[tuple[str, bytes], records.Schema] = {}
-        self._channels: list[records.Channel] = []
-        self._types: list[tuple[str, str]] = []  # type and QoS text of each channel
+        self._schemas: dict[tuple[str, str, bytes], Schema] = {}  # by name, encoding and text
+        self._topics: list[_Topic] = []
         self._finished: list[FileWriter] = []
         self._error: BagError | None = None
         self._closed = False
@@ -105,48 +103,40 @@ class BagWriter:
         qos: Sequence[QosProfile] | str = (),
         definition: str | None = None,
         type_hash: str | None = None,
+        encoding: str = ROS2MSG,
     ) -> int:
         """Announce a topic and return its number for `write`.
 
-        Parameters
-        ----------
-        name
-            The full topic name.
-        type_name
-            For example "sensor_msgs/msg/JointState".
-        qos
-            What its publishers offer, as profiles or as rosbag2's YAML text.
-        definition, type_hash
-            The type's definition (`ros2msg`) and RIHS01 hash; by default those of the installed type.
+        Args:
+            name: the full topic name.
+            type_name: for example "sensor_msgs/msg/JointState".
+            qos: what its publishers offer, as profiles or as rosbag2's YAML text.
+            definition, type_hash: the type's definition and RIHS01 hash; by default those of the installed type.
+            encoding: how the definition is written.
 
-        Raises
-        ------
-        BagError
-            The type is not installed, or writing failed.
+        Raises:
+            BagError: the type is not installed, or writing failed.
         """
         data = (schema.definition(type_name) if definition is None else definition).encode()
         digest = schema.type_hash(type_name) if type_hash is None else type_hash
-        quality = qos if isinstance(qos, str) else metadata.qos_text(qos)
+        quality = qos if isinstance(qos, str) else qos_text(qos)
         with self._lock:
             self._check()
-            if len(self._channels) == _MAX_TOPICS:
+            if len(self._topics) == _MAX_TOPICS:
                 raise BagError(f"{self.folder}: a bag holds at most {_MAX_TOPICS} topics: record fewer")
-            known = self._schemas.get((type_name, data))
-            channel_schema = known or records.Schema(len(self._schemas) + 1, type_name, "ros2msg", data)
-            channel = records.Channel(
-                len(self._channels) + 1,
-                channel_schema.id,
-                name,
-                "cdr",
-                {"offered_qos_profiles": quality, "topic_type_hash": digest},
+            key = type_name, encoding, data
+            known = self._schemas.get(key)
+            kind = known or Schema(id=len(self._schemas) + 1, name=type_name, encoding=encoding, data=data)
+            values = {"offered_qos_profiles": quality, "topic_type_hash": digest}
+            channel = Channel(
+                id=len(self._topics) + 1, schema_id=kind.id, topic=name, message_encoding="cdr", metadata=values
             )
             if known is None:
-                self._guarded(lambda: self._file.add_schema(channel_schema))
-                self._schemas[type_name, data] = channel_schema
+                self._guarded(lambda: self._file.add_schema(kind))
+                self._schemas[key] = kind
             self._guarded(lambda: self._file.add_channel(channel))
-            self._channels.append(channel)
-            self._types.append((type_name, quality))
-            return channel.id
+            self._topics.append(_Topic(type_name, channel))
+            return int(channel.id)
 
     def write(
         self,
@@ -158,22 +148,15 @@ class BagWriter:
     ) -> None:
         """Write a message.
 
-        Parameters
-        ----------
-        topic_id
-            From `add_topic`.
-        data
-            The serialized message: CDR with its 4-byte head.
-        log_time_ns, publish_time_ns
-            When it was received and published, in nanoseconds, from 0 on.
-        sequence
-            The publisher's count of messages, where it is known; 0 otherwise.
+        Args:
+            topic_id: from `add_topic`.
+            data: the serialized message: CDR with its 4-byte head.
+            log_time_ns, publish_time_ns: when it was received and published, in nanoseconds, from 0 on.
+            sequence: the publisher's count of messages, where it is known; 0 otherwise.
 
-        Raises
-        ------
-        BagError
-            Disk full, folder vanished, closed, an unknown topic or a time out of range. What was flushed
-            stays.
+        Raises:
+            BagError: disk full, folder vanished, closed, an unknown topic or a time out of range. What was flushed
+                stays.
         """
         with self._lock:
             if self._error is not None or self._closed:
@@ -195,22 +178,28 @@ class BagWriter:
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write named key-value pairs as an MCAP metadata record; it goes to the operating system at once.
 
-        Raises
-        ------
-        BagError
-            As `write`.
+        Raises:
+            BagError: as `write`.
         """
         with self._lock:
             self._check()
             self._guarded(lambda: self._file.write_metadata(name, dict(values)))
 
+    def write_attachment(self, attachment: Attachment) -> None:
+        """Write an attachment; it goes to the operating system at once.
+
+        Raises:
+            BagError: as `write`.
+        """
+        with self._lock:
+            self._check()
+            self._guarded(lambda: self._file.write_attachment(attachment))
+
     def flush(self) -> None:
         """Hand all messages to the operating system, and check that the bag is still there.
 
-        Raises
-        ------
-        BagError
-            Disk full or folder vanished.
+        Raises:
+            BagError: disk full or folder vanished.
         """
         with self._lock:
             self._check()
@@ -219,10 +208,8 @@ class BagWriter:
     def close(self) -> None:
         """Write the summary and `metadata.yaml`. A second call does nothing.
 
-        Raises
-        ------
-        BagError
-            Disk full or folder vanished. What was flushed stays readable.
+        Raises:
+            BagError: disk full or folder vanished. What was flushed stays readable.
         """
         with self._lock:
             if self._closed:
@@ -274,10 +261,10 @@ class BagWriter:
     def _open_file(self) -> None:
         path = self.folder / f"{self.folder.resolve().name}_{len(self._finished)}.mcap"
         self._file = FileWriter(path, self._compression)
-        for known in self._schemas.values():
-            self._file.add_schema(known)
-        for channel in self._channels:
-            self._file.add_channel(channel)
+        for kind in self._schemas.values():
+            self._file.add_schema(kind)
+        for topic in self._topics:
+            self._file.add_channel(topic.channel)
         self._split_at_ns = 0
         self._write_table()
 
@@ -302,13 +289,16 @@ class BagWriter:
 
     def _write_table(self) -> None:
         files = [*self._finished] if self._closed else [*self._finished, self._file]
-        counts = {channel.id: sum(file.counts.get(channel.id, 0) for file in files) for channel in self._channels}
         table = metadata.BagMetadata(
             topics=[
                 metadata.TopicEntry(
-                    channel.topic, type_name, quality, channel.metadata["topic_type_hash"], counts[channel.id]
+                    channel.topic,
+                    type_name,
+                    channel.metadata["offered_qos_profiles"],
+                    channel.metadata["topic_type_hash"],
+                    sum(file.counts.get(channel.id, 0) for file in files),
                 )
-                for channel, (type_name, quality) in zip(self._channels, self._types, strict=True)
+                for type_name, channel in self._topics
             ],
             files=[
                 metadata.FileEntry(file.path.name, file.start_ns, file.end_ns, file.message_count) for file in files

@@ -55,9 +55,15 @@ class ReplayNode(LoopNode):
         try:
             self.reader = BagReader(self.bag)
             self.recorded = Recorded.read(self.reader, str(self.bag)) if self.compare else None
+            self.begin_ns = self.reader.begin_ns
         except BagError as error:
             raise ValueError(str(error)) from None
-        duration = (self.reader.end_ns - self.reader.start_ns) / SECOND
+        if self.begin_ns > self.reader.start_ns:
+            before = (self.begin_ns - self.reader.start_ns) / SECOND
+            self.get_logger().warning(
+                f"{self.bag}: its first messages lie {before:g} s before all others: they are published at once"
+            )
+        duration = (self.reader.end_ns - self.begin_ns) / SECOND
         if not self.reader.end_ns or self.start > duration:
             raise ValueError(f"{self.bag}: nothing in it after {self.start:g} s: it lasts {duration:g} s")
         self.namespace = self.recorded.namespace if self.recorded else self.reader.custom_data.get("namespace", "/")
@@ -105,7 +111,9 @@ class ReplayNode(LoopNode):
             return None
 
     def _is_latched(self, topic: str) -> bool:
-        return "transient_local" in self.reader.topics[topic].qos or self._relative(topic) == "scenario_plan"
+        offered = self.reader.topics[topic].profiles
+        latched = any(profile.durability == "transient_local" for profile in offered)
+        return latched or self._relative(topic) == "scenario_plan"
 
     # Playing, in the thread
 
@@ -127,7 +135,7 @@ class ReplayNode(LoopNode):
             os.kill(os.getpid(), signal.SIGINT)  # ends the node in order, as Ctrl-C does
 
     def _play_through(self) -> None:
-        first_ns = self.reader.start_ns + round(self.start * SECOND)
+        first_ns = self.begin_ns + round(self.start * SECOND)
         began = time.monotonic()
         for topic, log_ns, _, data in self._messages(first_ns):
             if self.recorded is None:
@@ -139,9 +147,9 @@ class ReplayNode(LoopNode):
                 return
 
     def _messages(self, first_ns: int) -> Iterator[Message]:
-        """From a time on; before it, what a latecomer would still be given."""
-        latched = [topic for topic in self.publishers_of if self._is_latched(topic)]
-        for message in self.reader.messages(latched, stop_ns=first_ns) if latched and self.start else ():
+        """From a time on; before it, what a latecomer would still be given, and first messages far before the rest."""
+        before = [topic for topic in self.publishers_of if self._is_latched(topic) or not self.start]
+        for message in self.reader.messages(before, stop_ns=first_ns) if before else ():
             yield message[0], first_ns, message[2], message[3]
         topics = [*self.publishers_of, *([CLOCK] if self.clock and CLOCK in self.reader.topics else [])]
         yield from self.reader.messages(topics, start_ns=first_ns)

@@ -169,6 +169,48 @@ def test_another_controller_is_told_apart(graph: Any, bag: Path) -> None:
     assert "other parameters" in replay.log and " 0 differ" not in replay.log
 
 
+def test_first_messages_far_before_the_rest_are_not_waited_for(graph: Any, tmp_path: Path) -> None:
+    """As those that came before the first `/clock`, and so bear the time 0."""
+    from sensor_msgs.msg import JointState
+
+    with BagWriter(tmp_path / "robot") as writer:
+        topic = writer.add_topic("/joint_states", JOINT_STATE)
+        for step, time_ns in enumerate((0, *range(1000 * 10**9, 1001 * 10**9, 10**7))):
+            writer.write(topic, joint_state(step, "base"), time_ns, time_ns)
+    states = graph.collect("joint_states", JointState)
+    replay = graph.start("replay", bag=str(tmp_path / "robot"), rate=0.2)
+    graph.wait_until(lambda: len(states) >= 10, 30, "joint states")
+    assert "first messages lie 1000 s before all others" in replay.log
+
+
+NUMBERS = "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 1"
+WORDS = "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local"
+
+
+@pytest.mark.parametrize("qos", [NUMBERS, WORDS])
+def test_what_was_latched_is_latched_again_whichever_distribution_wrote_it(
+    graph: Any, tmp_path: Path, qos: str
+) -> None:
+    from rclpy.qos import DurabilityPolicy
+
+    with BagWriter(tmp_path / "robot") as writer:
+        latched, other = (
+            writer.add_topic(name, JOINT_STATE, qos=text) for name, text in (("/map", qos), ("/odom", ""))
+        )
+        for time_ns in range(0, 50 * 10**9, 10**9):
+            for topic in (latched, other):
+                writer.write(topic, joint_state(0, ""), time_ns, time_ns)
+    graph.start("replay", bag=str(tmp_path / "robot"))
+
+    def durability(topic: str) -> Any:
+        found = graph.node.get_publishers_info_by_topic(topic)
+        return found[0].qos_profile.durability if found else None
+
+    graph.wait_until(lambda: durability("/map") and durability("/odom"), 60, "the publishers")
+    assert durability("/map") == DurabilityPolicy.TRANSIENT_LOCAL
+    assert durability("/odom") == DurabilityPolicy.VOLATILE
+
+
 def test_a_missing_bag_is_refused_in_one_line(graph: Any, tmp_path: Path) -> None:
     replay = graph.start("replay", bag=str(tmp_path / "none"))
     wait_for_end(graph, replay, 2)

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.bag import BagError, schema
 from tdof_npid_ros.bag.cdr import without_padding
-from tdof_npid_ros.bag.metadata import QosProfile
+from tdof_npid_ros.bag.qos import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
