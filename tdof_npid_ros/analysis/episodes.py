@@ -141,7 +141,7 @@ def _episodes(loop: ObservedLoop) -> Iterator[Episode]:
     answers = _Answers.of(loop.effort)
     output = _without_lone_zeros(loop.output)
     known = configurations(loop.histories)
-    names = _plan_names(loop.scenario, loop.plans)
+    names = plan_names(loop.scenario, loop.plans)
     driven = _driven(loop)
     for count, stretch in enumerate(_stretches(output), start=1):
         label = _episode_of(output, stretch)
@@ -437,7 +437,7 @@ def _grid(stamps: np.ndarray, period_ns: int, plan: Plan | None, bag: str) -> np
     return np.arange(stamps[0], stamps[-1] + 1, period_ns, dtype=np.int64)
 
 
-def _plan_names(scenario: ParameterHistory | None, plans: Mapping[str, Plan]) -> dict[str, str]:
+def plan_names(scenario: ParameterHistory | None, plans: Mapping[str, Plan]) -> dict[str, str]:
     """What the scenario calls the plans, by digest."""
     names: dict[str, str] = {}
     for _, values in scenario.sets() if scenario is not None else ():

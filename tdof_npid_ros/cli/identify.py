@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from tdof_npid_ros.cli.choice import add_choice, choice
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.identify import identify
 from tdof_npid_ros.identification.records import read_records
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help="bag folders, .mcap or .db3 files of one plant")
     parser.add_argument("--episode", metavar="NAME", help="only this episode, by name or number (default: all)")
+    add_choice(parser)
     parser.add_argument("--structure", metavar="NAME", help=f"instead of the best: {', '.join(STRUCTURES)}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the plant as a parameter file for all commands")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="picture of measured and predicted output")
@@ -36,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.out.exists():
             raise OutputError(f"{arguments.out} exists and is not overwritten: give another name")
     check_outputs([path for path in (arguments.out, arguments.plot) if path], [Path(bag) for bag in arguments.bags])
-    records = read_records(arguments.bags, arguments.episode)
+    records = read_records(arguments.bags, arguments.episode, choice(arguments))
     structures = [STRUCTURES[arguments.structure]] if arguments.structure else list(STRUCTURES.values())
     found = identify([record.stretch for record in records], structures)
     title = f"Identified from {', '.join(Path(bag).name for bag in arguments.bags)}"

@@ -9,12 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from tdof_npid_ros.analysis.recording import Loop, Signal, read_loops
+from tdof_npid_ros.analysis.episodes import plan_names
+from tdof_npid_ros.analysis.loops import ObservedLoop, observed_loops
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen, Source, read_track
+from tdof_npid_ros.analysis.tracks import Key, Track, matched
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.field_path import FieldPath, Step
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.plants.catalog import make_plant
-from tdof_npid_ros.wire import EpisodeLabel
+from tdof_npid_ros.wire import JOINT_STATE, EpisodeLabel
 
 LEAST_STRETCH = 10  # samples; shorter ones are left out
 GAP = 20.0  # periods without an output end a stretch
@@ -42,12 +46,14 @@ class Record:
     notes: tuple[str, ...] = ()
 
 
-def read_records(bags: Sequence[str | Path], episode: str | None = None, lane: str | int | None = None) -> list[Record]:
+def read_records(
+    bags: Sequence[str | Path], episode: str | None = None, chosen: Chosen = NOTHING_CHOSEN
+) -> list[Record]:
     """The records in some bags.
 
     Args:
         episode: only stretches of that name or number; None: all.
-        lane: the joint's name or place; None: there must be one alone.
+        chosen: which topics and fields are output and effort, where the user says so.
 
     Raises:
         IdentificationError: there is none, or several loops or joints.
@@ -56,30 +62,47 @@ def read_records(bags: Sequence[str | Path], episode: str | None = None, lane: s
     records: list[Record] = []
     for bag in bags:
         with BagReader(Path(bag)) as reader:
-            loops = read_loops(reader, str(bag))
-            if len(loops) > 1:
-                raise IdentificationError(
-                    f"{bag}: outputs of several loops in it ({', '.join(loop.topic for loop in loops)}): choose one "
-                    f"with --output"
-                )
-            records += _records(loops[0], lane)
+            loop, key = _only_one(observed_loops(reader, str(bag), chosen), str(bag))
+            records += _records(reader, loop, key, chosen)
+    if not records:
+        raise IdentificationError(
+            f"{', '.join(map(str, bags))}: no stretch of {LEAST_STRETCH} outputs with an effort in it: record "
+            f"longer, and "
+            "the effort too; choose it with --effort TOPIC:FIELD where it is not found"
+        )
     if episode is not None:
         names = list(dict.fromkeys(record.name for record in records))
         records = [record for record in records if episode in (record.name, str(record.number))]
         if not records:
-            raise IdentificationError(
-                f"no episode {episode!r}: there are {', '.join(names) or 'none'}, and numbers from 1"
-            )
-    if not records:
-        raise IdentificationError(
-            f"{', '.join(map(str, bags))}: no stretch of {LEAST_STRETCH} outputs with an effort: record longer"
-        )
+            raise IdentificationError(f"no episode {episode!r}: there are {', '.join(names)}, and numbers from 1")
     return records
 
 
-def _records(loop: Loop, lane: str | int | None) -> Iterator[Record]:
+def _only_one(loops: Sequence[ObservedLoop], bag: str) -> tuple[ObservedLoop, Key]:
+    """The one loop with one joint.
+
+    Raises:
+        IdentificationError: there are others, and which is meant is not said.
+    """
+    found = [(loop, key) for loop in loops for key in loop.output.keys if key in loop.output.driven()]
+    if len(found) == 1:
+        return found[0]
+    topics = [f"{loop.output.source}[{key}]" for loop, key in found]
+    raise IdentificationError(
+        f"{bag}: {len(found)} outputs in it ({', '.join(topics[:8])}{', …' if len(topics) > 8 else ''}): choose one "
+        f"with "
+        "--output TOPIC:FIELD[NAME], and with --effort what drives it"
+        if found
+        else f"{bag}: no output in it: choose one with --output TOPIC:FIELD"
+    )
+
+
+def _records(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) -> Iterator[Record]:
     output = loop.output
-    column = _column(loop, lane)
+    measured = output.table([key])[:, 0]
+    told, kind = _applied(reader, loop, key, chosen)
+    names = plan_names(loop.scenario, loop.plans)
+    setpoints = loop.acted_on or loop.setpoint
     number = 0
     for part in _parts(output):
         label = EpisodeLabel.named_in(str(output.frame_id[part.start]))
@@ -87,34 +110,39 @@ def _records(loop: Loop, lane: str | int | None) -> Iterator[Record]:
         if len(stamps) < LEAST_STRETCH:
             continue
         number += 1
-        y = _values(output.position[part], column)[first]
-        applied, notes = _applied(loop, part, first, stamps, column)
-        if applied is None:
+        y, receive = measured[part][first], output.receive_ns[part][first]
+        period_ns = float(np.median(np.diff(stamps)))
+        if told is not None:
+            until = told[part][first]
+            effort = np.append(until[1:], until[-1])
+        elif loop.effort is not None:
+            effort = _held(loop.effort, key, stamps, receive, period_ns)
+        else:
             continue
-        known = np.isfinite(y) & np.isfinite(applied)
-        if np.count_nonzero(known) < LEAST_STRETCH:
-            continue
-        stamps, y, applied = stamps[known], y[known], applied[known]
         plan = loop.plans.get(label.plan) if label is not None else None
-        time = (stamps - stamps[0]) / 1e9
-        period = float(np.median(np.diff(time)))
-        even = bool(np.abs(time - np.arange(len(time)) * period).max() < EVEN * period * len(time) and _is_even(time))
-        before, limits = _from_plant(loop, float(output.publish_ns[part.start]))
-        at_rest = label is not None and known[0] and (plan is None or stamps[0] == 0)
-        stretch = Stretch(time, applied, y, at_rest, before if at_rest else float(applied[0]), even)
-        setpoint = np.full(len(time), np.nan)
+        notes = [*loop.notes, kind]
         if plan is not None:
-            signals = plan.sampled(round(period * 1e9))
-            at = np.minimum(np.round(stamps / (period * 1e9)).astype(int), signals.steps)
+            signals = plan.sampled(round(period_ns))
+            at = np.clip(np.round(stamps / period_ns).astype(int), 0, signals.steps)
             setpoint = signals.setpoint[at]
             if np.any(signals.disturbance[at]):
-                stretch = replace(stretch, effort=stretch.effort + signals.disturbance[at])
-                notes = (*notes, "the plan's disturbance is added to the effort")
-        elif loop.control_effort is not None and len(loop.control_effort):
-            setpoint = _by_stamp(loop.control_effort, "position", stamps, column)
-        yield Record(
-            label.plan if label is not None and label.plan else "recording", number, stretch, setpoint, limits, notes
+                effort = effort + signals.disturbance[at]
+                notes.append("the plan's disturbance is added to the effort")
+        elif setpoints is not None:
+            setpoint = _held(setpoints, key, stamps, receive, period_ns)
+        else:
+            setpoint = np.full(len(stamps), np.nan)
+        known = np.isfinite(y) & np.isfinite(effort)
+        if np.count_nonzero(known) < LEAST_STRETCH:
+            continue
+        time = (stamps[known] - stamps[known][0]) / 1e9
+        before, limits = _from_plant(loop, int(receive[0]))
+        at_rest = label is not None and bool(known[0]) and (plan is None or stamps[0] == 0)
+        stretch = Stretch(
+            time, effort[known], y[known], at_rest, before if at_rest else float(effort[known][0]), _is_even(time)
         )
+        name = names.get(label.plan, label.plan) if label is not None and label.plan else "recording"
+        yield Record(name, number, stretch, setpoint[known], limits, tuple(note for note in notes if note))
 
 
 def _is_even(time: np.ndarray) -> bool:
@@ -122,7 +150,7 @@ def _is_even(time: np.ndarray) -> bool:
     return bool(steps.max() - steps.min() <= 2e-9 + EVEN * steps.mean())
 
 
-def _parts(output: Signal) -> list[slice]:
+def _parts(output: Track) -> list[slice]:
     """Stretches in which the episode is the same and the stamps go on, without a gap."""
     count = len(output)
     if count < 2:
@@ -135,61 +163,49 @@ def _parts(output: Signal) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, starts[1:], strict=False)]
 
 
-def _column(loop: Loop, lane: str | int | None) -> int:
-    names = [str(name) for name in loop.output.name[0]] if len(loop.output.name) else []
-    count = len(loop.output.position[0]) if len(loop.output) else 0
-    if lane is None:
-        if count != 1:
-            raise IdentificationError(
-                f"{loop.bag}: {loop.topic} has {count} joints ({', '.join(names) or 'without names'}): choose one, "
-                f"as in "
-                f"--output {loop.topic}:position[{names[-1] if names else 0}]"
-            )
-        return 0
-    if isinstance(lane, int) and lane < count:
-        return lane
-    if lane in names:
-        return names.index(str(lane))
-    raise IdentificationError(f"{loop.bag}: {loop.topic} has no joint {lane}: there are {', '.join(names) or count}")
+def _applied(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) -> tuple[np.ndarray | None, str]:
+    """The effort that the outputs' own messages tell, by message: what was applied until then; and what to say of it.
 
-
-def _values(rows: np.ndarray, column: int) -> np.ndarray:
-    if rows.dtype != object:
-        return rows[:, column].astype(np.float64) if rows.shape[1] > column else np.full(len(rows), np.nan)
-    return np.array([row[column] if len(row) > column else np.nan for row in rows], dtype=np.float64)
-
-
-def _applied(
-    loop: Loop, part: slice, first: np.ndarray, stamps: np.ndarray, column: int
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """The effort held from each stamp on.
-
-    `output.effort` is the one that was applied until its stamp, so that of the next output counts. Without it, the
-    controller's answers are taken from the stamps on that they answer.
+    None where they tell none that moves, or where the user names another.
     """
-    told = _values(loop.output.effort[part], column)[first]
-    if np.isfinite(told).sum() > 1 and np.ptp(told[np.isfinite(told)]) > 0.0:
-        return np.append(told[1:], told[-1]), ("the effort is the output's, the one that was applied",)
-    if loop.control_effort is None or not len(loop.control_effort):
-        return (None, ()) if not np.isfinite(told).any() else (np.append(told[1:], told[-1]), ())
-    return _by_stamp(loop.control_effort, "effort", stamps, column), (
-        "the effort is the controller's, before any limit of the plant",
-    )
+    path = FieldPath.parse(loop.output.source)
+    theirs = "the effort is the one that the controller asks for: any limit of the actuator is not in it"
+    if chosen.effort is not None and chosen.effort.topic.lstrip("/") != path.topic.lstrip("/"):
+        return None, ""
+    if reader.topics[path.topic].type != JOINT_STATE and chosen.effort is None:
+        return None, theirs
+    own = chosen.effort or FieldPath(path.topic, "", (Step("effort", path.steps[-1].element),))
+    track = read_track(reader, Source("effort", replace(own, topic=path.topic)))
+    values = matched(track, [key])[:, 0]
+    if len(track) != len(loop.output):
+        values = values[np.clip(np.searchsorted(track.log_ns, loop.output.log_ns), 0, len(track) - 1)]
+    known = values[np.isfinite(values)]
+    if not len(known) or (np.ptp(known) == 0.0 and loop.effort is not None and chosen.effort is None):
+        return None, theirs
+    return values, "the effort is the output's own, as it was applied"
 
 
-def _by_stamp(signal: Signal, field: str, stamps: np.ndarray, column: int) -> np.ndarray:
-    """The newest value at each stamp; NaN before the first."""
-    times, last = np.unique(signal.stamp_ns[::-1], return_index=True)
-    values = _values(getattr(signal, field), column)[::-1][last]
-    at = np.searchsorted(times, stamps, side="right") - 1
-    return np.where(at >= 0, values[np.maximum(at, 0)], np.nan)
+def _held(track: Track, key: Key, stamps: np.ndarray, receive: np.ndarray, period_ns: float) -> np.ndarray:
+    """What holds from each output on, as near as half a sample: by the stamps where both have them, else as
+    received."""
+    table = matched(track, [key])[:, 0]
+    kept = np.isfinite(table)
+    times, values = track.stamp_ns[kept], table[kept]
+    if not len(values):
+        return np.full(len(stamps), np.nan)
+    overlaps = times.max() >= stamps[0] and times.min() <= stamps[-1] and np.ptp(times) > 0
+    if not (track.has_header and overlaps):
+        times, stamps = track.receive_ns[kept], receive
+    order = np.argsort(times, kind="stable")
+    at = np.searchsorted(times[order], stamps + 0.5 * period_ns, side="right") - 1
+    return np.where(at >= 0, values[order][np.maximum(at, 0)], np.nan)
 
 
-def _from_plant(loop: Loop, time_ns: float) -> tuple[float, tuple[float, float]]:
+def _from_plant(loop: ObservedLoop, time_ns: int) -> tuple[float, tuple[float, float]]:
     """The effort before an episode and its limits, as far as a simulated plant's parameters tell."""
     if loop.plant is None:
         return 0.0, (-math.inf, math.inf)
-    values = loop.plant.at(round(time_ns))
+    values = loop.plant.at(time_ns)
     limits = (float(values.get("effort_min", -math.inf)), float(values.get("effort_max", math.inf)))
     try:
         return float(make_plant(str(values["model"]), values).initial_effort), limits

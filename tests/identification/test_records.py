@@ -1,0 +1,110 @@
+"""Records from bags of our own and of other people: topics and fields as they are, stamped or not."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.analysis.sources import Chosen
+from tdof_npid_ros.identification import IdentificationError
+from tdof_npid_ros.identification.identify import Identified, identify
+from tdof_npid_ros.identification.records import Record, read_records
+from tdof_npid_ros.identification.structures import STRUCTURES
+from tdof_npid_ros.plants.linear import TransferFunction
+from tdof_npid_ros.plants.simulator import PlantSimulator
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "analysis"))
+from foreign_bags import (
+    FLOAT64,
+    FLOAT64_ARRAY,
+    H_NS,
+    JOINT_STATE,
+    START_NS,
+    Message,
+    float64,
+    floats,
+    joints,
+    write,
+)
+
+GAIN, TIME_CONSTANT, DEAD_TIME = 3.0, 0.2, 0.035
+SAMPLES = 600
+
+
+def driven() -> tuple[np.ndarray, np.ndarray]:
+    """Effort and output of a plant at an operating point, stepped up and down."""
+    k = np.arange(SAMPLES)
+    effort = 20.0 + np.select([k < 60, k < 200, k < 350, k < 470], [0.0, 5.0, -3.0, 4.0], 1.0)
+    plant = TransferFunction((GAIN,), (TIME_CONSTANT, 1.0), DEAD_TIME, 50.0, 20.0)
+    simulator = PlantSimulator(plant, H_NS, 1, (-math.inf, math.inf))
+    output = np.zeros(SAMPLES)
+    for i in range(SAMPLES):
+        output[i] = simulator.output[0]
+        simulator.advance(effort[i : i + 1], np.zeros(1))
+    return effort, output
+
+
+def found_in(records: list[Record]) -> Identified:
+    return identify([record.stretch for record in records], [STRUCTURES["first_order"]])
+
+
+def check(found: Identified, dead_time: float = DEAD_TIME) -> None:
+    values = found.values
+    assert values["gain"] == pytest.approx(GAIN, rel=1e-3)
+    assert values["time_constant"] == pytest.approx(TIME_CONSTANT, rel=1e-2)
+    assert values["dead_time"] == pytest.approx(dead_time, abs=1e-3)
+    assert found.level == pytest.approx(50.0, abs=0.01)
+    assert found.effort_level == pytest.approx(20.0)
+
+
+def test_float64_topics_without_stamps(tmp_path: Path) -> None:
+    effort, output = driven()
+    messages: list[Message] = []
+    for k in range(SAMPLES):
+        messages.append((k * H_NS, "/temperature", FLOAT64, float64(output[k])))
+        messages.append((k * H_NS + 1_000_000, "/heater", FLOAT64_ARRAY, floats([0.0, effort[k]])))
+    bag = write(tmp_path / "bag", messages)
+    chosen = Chosen.read("/temperature:data", None, "/heater:data[1]")
+    check(found_in(read_records([bag], chosen=chosen)))
+
+
+def test_one_joint_of_several_with_its_own_effort(tmp_path: Path) -> None:
+    """The effort in the message of an output is the one until then."""
+    effort, output = driven()
+    messages: list[Message] = []
+    for k in range(1, SAMPLES):
+        stamp = START_NS + k * H_NS
+        values = {"wrist": 0.1 * k, "elbow": output[k]}
+        message = joints(values, stamp, effort=[0.0, effort[k - 1]])
+        messages.append((k * H_NS, "/joint_states", JOINT_STATE, message))
+    bag = write(tmp_path / "bag", messages)
+    with pytest.raises(IdentificationError, match=r"2 outputs in it.*elbow.*choose one with --output"):
+        read_records([bag])
+    chosen = Chosen.read("/joint_states:position[elbow]", None, None)
+    (record,) = read_records([bag], chosen=chosen)
+    check(found_in([record]))
+
+
+def test_two_bags_are_one_plant_s(tmp_path: Path) -> None:
+    effort, output = driven()
+    bags = []
+    for name, part in (("a", range(300)), ("b", range(300, SAMPLES))):
+        messages: list[Message] = []
+        for k in part:
+            messages.append((k * H_NS, "/temperature", FLOAT64, float64(output[k])))
+            messages.append((k * H_NS + 1_000_000, "/heater", FLOAT64, float64(effort[k])))
+        bags.append(write(tmp_path / name, messages))
+    records = read_records(bags, chosen=Chosen.read("/temperature:data", None, "/heater:data"))
+    assert len(records) == 2
+    assert found_in(records).values["gain"] == pytest.approx(GAIN, rel=0.01)
+
+
+def test_a_bag_without_an_effort_is_refused(tmp_path: Path) -> None:
+    _, output = driven()
+    bag = write(tmp_path / "bag", [(k * H_NS, "/temperature", FLOAT64, float64(y)) for k, y in enumerate(output)])
+    with pytest.raises(IdentificationError, match="choose it with --effort"):
+        read_records([bag], chosen=Chosen.read("/temperature:data", None, None))
