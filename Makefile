@@ -4,7 +4,11 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test report lint bench bench-long bench-small clean
+# The documentation as a site, in docs/_build; a warning is an error.
+docs: $(VENV)/.test
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build
+
+.PHONY: docs demo test report lint bench bench-long bench-small clean
 
 demo: $(VENV)/.run
 	$(BIN)/tdof-npid demo

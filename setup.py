@@ -42,6 +42,8 @@ TEST = [
     "rosbags",
     "mcap-ros2-support",
     "playwright",
+    "sphinx>=7",
+    "myst-parser>=3",
     "colcon-core",
     "colcon-ros",
     "colcon-package-selection",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -200,15 +200,64 @@ def load_case(name: str | Path) -> Case:
 
     Raises:
         ParameterFileError, PlantError, PlanError, GainsError: the file is missing or something in it is wrong.
+
+    Example:
+        >>> case = load_case("p1-c0.5")
+        >>> case.gains.kp, case.sample_period, list(case.episodes)
+        (9.426, 0.005, ['setpoint', 'disturbance'])
     """
     path = find_parameter_file(name)
-    nodes = {node: read_parameters(path, node) for node in ("plant", "controller", "scenario", "tuner")}
+    nodes = {node: read_parameters(path, node) for node in _OF_CASE}
     try:
-        model = named_model(nodes["plant"].get("model", PLANT["model"].default), path.parent)
-        tables: dict[str, Table] = {**NODES, "plant": {**PLANT, **model_table(model)}}
-        plant, controller, scenario, tuner = (_checked(values, tables[node]) for node, values in nodes.items())
+        return _case_of(path.stem, nodes, path.parent)
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
+
+
+def make_case(
+    plant: Mapping[str, Any],
+    controller: Mapping[str, Any],
+    episodes: Mapping[str, Sequence[str]],
+    *,
+    sample_period: float = SAMPLE_PERIOD.default,
+    tuner: Mapping[str, Any] | None = None,
+    name: str = "case",
+) -> Case:
+    """A case without a parameter file: the same parameters, as mappings.
+
+    Args:
+        plant: `model` and its parameters, `effort_min`, `effort_max`.
+        controller: `type`, the gains and what is set around the law.
+        episodes: the lines of each plan, by the episode's name.
+        sample_period: s.
+        tuner: `bounds.kp`, … and `weight`.
+
+    Raises:
+        ParameterFileError, PlantError, PlanError, GainsError: something in it is wrong.
+
+    Example:
+        >>> case = make_case(
+        ...     {"model": "first_order", "gain": 2.0, "time_constant": 3.0, "dead_time": 0.2},
+        ...     {"type": "pid", "kp": 2.0, "ki": 1.0},
+        ...     {"setpoint": ["0 setpoint 1", "20 end"]},
+        ... )
+        >>> round(case.setpoint_response().overshoot_percent, 1)
+        5.6
+    """
+    scenario = {"episodes": list(episodes)} | {f"plan.{one}": list(lines) for one, lines in episodes.items()}
+    given = (plant, controller, scenario, tuner or {})
+    common = {"sample_period": sample_period}
+    return _case_of(name, {node: {**common, **values} for node, values in zip(_OF_CASE, given, strict=True)}, None)
+
+
+_OF_CASE = ("plant", "controller", "scenario", "tuner")  # the nodes whose parameters make a case
+
+
+def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | None) -> Case:
+    """The case that nodes with these parameters are; `folder` is where a plant's class may lie, too."""
+    model = named_model(nodes["plant"].get("model", PLANT["model"].default), folder)
+    tables: dict[str, Table] = {**NODES, "plant": {**PLANT, **model_table(model)}}
+    plant, controller, scenario, tuner = (_checked(nodes[node], tables[node]) for node in _OF_CASE)
     periods = {
         node: values["sample_period"]
         for node, values in (("plant", plant), ("controller", controller), ("scenario", scenario))
@@ -216,27 +265,24 @@ def load_case(name: str | Path) -> Case:
     }
     if len(set(periods.values())) > 1:
         told = " and ".join(f"{period} in {node}" for node, period in periods.items())
-        raise ParameterFileError(f"{path}: sample_period is {told}: the nodes of a loop need the same, give it to /**")
-    try:
-        case = Case(
-            name=path.stem,
-            sample_period_ns=sample_period_in_ns(plant.get("sample_period", SAMPLE_PERIOD.default)),
-            model=model,
-            plant_values=plant,
-            effort_limits=effort_limits(plant),
-            gains=gains_from_mapping(controller),
-            episodes=read_episodes(scenario),
-            bounds=read_bounds(tuner),
-            weight=tuner.get("weight", WEIGHT.default),
-            options=options_from_mapping(controller),
-        )
-        _ = case.plant, case.plans
-        case = _with_scale(case, "sigma" in controller)
-    except ValueError as error:
-        raise type(error)(f"{path}: {error}") from error
+        raise ParameterFileError(f"sample_period is {told}: the nodes of a loop need the same, give it to /**")
+    case = Case(
+        name=name,
+        sample_period_ns=sample_period_in_ns(plant.get("sample_period", SAMPLE_PERIOD.default)),
+        model=model,
+        plant_values=plant,
+        effort_limits=effort_limits(plant),
+        gains=gains_from_mapping(controller),
+        episodes=read_episodes(scenario),
+        bounds=read_bounds(tuner),
+        weight=tuner.get("weight", WEIGHT.default),
+        options=options_from_mapping(controller),
+    )
+    _ = case.plant, case.plans
+    case = _with_scale(case, "sigma" in controller)
     for node, values in nodes.items():
         for warning in misspelt(values, tables[node]):
-            warnings.warn(f"{path}: {node}: {warning}", stacklevel=2)
+            warnings.warn(f"{name}: {node}: {warning}", stacklevel=3)
     return case
 
 

@@ -96,7 +96,7 @@ def shown_until(panel: Panel) -> float:
         >>> t = np.linspace(0, 100, 1001)
         >>> rise = 1 - np.exp(-t)
         >>> shown_until(Panel("", [Curve("", t, rise, rise)]))
-        6.1
+        6.5
     """
     begin, end = panel.begin, panel.end
     last = begin + LEAST_SHOWN * (end - begin)
