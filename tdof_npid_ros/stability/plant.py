@@ -79,7 +79,7 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
     Example:
         >>> from tdof_npid_ros.case import load_case
         >>> loop_plant(load_case("p1-c4")).lag
-        801
+        401
     """
     plant, h = case.plant, case.sample_period
     sampled = plant.sampled(case.sample_period_ns)
