@@ -38,7 +38,7 @@ START = "start"  # the column of a plan that begins at rest; its value is the sa
 LONGEST_REST, SHORTEST_REST = 0.2, 0.05  # fractions of an episode: the stretch from which is judged whether it rests
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
 LONGEST_TIME = 1e9  # s, thirty years: of a plan and of whatever lasts in it
-MOST_VALUES = 300_000  # points times signals, as many as ramps over five minutes at 1 ms make: a plan is one message
+MOST_VALUES = 150_000  # points times signals, as many as ramps over two minutes at 1 ms make: a plan is one message
 GRAMMAR = (
     "TIME setpoint|disturbance|plant.NAME VALUE, TIME SIGNAL ramp VALUE over SECONDS, "
     "TIME SIGNAL sine AMPLITUDE period SECONDS for SECONDS, 0 start VALUE, or TIME end"

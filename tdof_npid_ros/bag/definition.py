@@ -72,6 +72,11 @@ class Definition:
         """The fields of a type, by default of the message itself."""
         return self.types[type_name or self.root]
 
+    @property
+    def has_sequence_of_messages(self) -> bool:
+        """Whether a few bytes of a message can announce many messages within it."""
+        return any(field.count == -1 and field.type in self.types for type_ in self.types.values() for field in type_)
+
     @cached_property
     def paths(self) -> dict[str, Field]:
         """The last field of each flattened path, such as "header.frame_id" or "points.positions", in order.

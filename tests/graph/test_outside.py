@@ -84,6 +84,40 @@ def test_replay_and_analysis_import_nothing_for_a_type_in_a_bag(graph: Any, tmp_
     assert not executed.exists()
 
 
+@pytest.mark.parametrize("count", [2**16, 2**24, 2**27, 2**32 - 1])
+def test_a_few_bytes_that_announce_many_messages_take_no_memory(graph: Any, count: int) -> None:
+    """The middleware would make room for all of them before it finds that they are not there."""
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from trajectory_msgs.msg import JointTrajectory
+
+    nodes = {
+        "plant": graph.start("plant", mode="lockstep"),
+        "controller": graph.start("controller"),
+        "scenario": graph.start("scenario", mode="lockstep"),
+    }
+    graph.wait_for_nodes(*(f"/{node}" for node in nodes))
+    for subscription in list(graph.node.subscriptions):  # the test's own node is not so careful
+        if subscription.topic_name == "/diagnostics":
+            graph.node.destroy_subscription(subscription)
+    header = b"\0\1\0\0" + bytes(8) + (1).to_bytes(4, "little") + bytes(4)
+    plan = header + bytes(4) + count.to_bytes(4, "little") + bytes(48)
+    diagnostics = header + count.to_bytes(4, "little") + bytes(48)
+    qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for topic, kind, data, words in (
+        ("/scenario_plan", JointTrajectory, plan, "unreadable scenario_plan refused"),
+        ("/diagnostics", DiagnosticArray, diagnostics, "unreadable /diagnostics refused"),
+    ):
+        publisher = graph.node.create_publisher(kind, topic, qos)
+        hearers = [node for node in nodes if (node == "scenario") == (topic == "/diagnostics")]
+        for node in hearers:
+            graph.publish_until(publisher, data, lambda n=node, w=words: w in nodes[n].log, what=f"{words} by {node}")
+    for node, process in nodes.items():
+        status = Path(f"/proc/{process.process.pid}/status").read_text()
+        (peak,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
+        assert int(peak) < 1_000_000, (node, peak)  # kB
+
+
 @pytest.mark.parametrize("node", NODES)
 def test_no_type_of_a_parameter_ends_a_node(graph: Any, node: str, tmp_path: Path) -> None:
     """Over each service that sets parameters, and over the rest of those that rclpy makes."""

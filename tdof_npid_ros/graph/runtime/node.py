@@ -14,8 +14,12 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from tdof_npid_ros.bag import schema
+from tdof_npid_ros.bag.cdr import decode
+from tdof_npid_ros.bag.definition import parse
 from tdof_npid_ros.graph.runtime.endpoints import Endpoints
 from tdof_npid_ros.graph.runtime.messages import diagnostics_message
 from tdof_npid_ros.graph.runtime.own_services import guard_services
@@ -128,10 +132,41 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     # before.
 
     def create_subscription(
-        self, message_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Callable[..., Any],
+        *args: Any,
+        raw: bool = False,
+        **kw: Any,
     ) -> Any:
-        """As `Node.create_subscription`; one made in `activate` is silent once the node is inactive."""
-        return super().create_subscription(message_type, topic, self._while_active(callback), *args, **kw)
+        """As `Node.create_subscription`; one made in `activate` is silent once the node is inactive.
+
+        Of a message whose bytes are wrong, nothing is made: the middleware would first make room for as many messages
+        within it as the bytes say, gigabytes for a few bytes.
+        """
+        on_data = callback if raw else self._of_bytes(message_type, topic, callback)
+        return super().create_subscription(
+            message_type, topic, self._while_active(on_data), *args, raw=raw or on_data is not callback, **kw
+        )
+
+    def _of_bytes(self, message_type: Any, topic: str, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A callback for a type's serialized messages; the callback itself where no message can hold many others."""
+        type_name = f"{message_type.__module__.partition('.')[0]}/msg/{message_type.__name__}"
+        definition = schema.definition(type_name)
+        if not parse(type_name, definition).has_sequence_of_messages:
+            return callback
+
+        def on_data(data: bytes) -> None:
+            try:
+                decode(type_name, definition, data)
+                message = deserialize_message(data, message_type)
+            except Exception as error:  # of ours or of the middleware's
+                self.refuse("rejected", f"unreadable {topic} refused", f": {error}")
+            else:
+                callback(message)
+
+        return on_data
 
     def create_timer(self, period: float, callback: Callable[..., Any], *args: Any, **kw: Any) -> Any:
         """As `Node.create_timer`; one made in `activate` is silent once the node is inactive."""
