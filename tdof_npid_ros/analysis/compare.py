@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.analysis.recording import Loop, read_loops
+from tdof_npid_ros.analysis.loops import recorded_loops
+from tdof_npid_ros.analysis.recording import Loop
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.names import in_namespace
@@ -38,7 +39,7 @@ class Recorded:
         Raises:
             BagError: there are none, or several controllers', or the bag is damaged.
         """
-        loops = [loop for loop in read_loops(reader, bag) if loop.control_effort is not None]
+        loops = [loop for loop in recorded_loops(reader, bag) if loop.control_effort is not None]
         recorder_namespace = in_namespace(reader.custom_data.get("namespace", "/"))
         loops = [loop for loop in loops if loop.namespace == recorder_namespace] or loops
         if not loops:

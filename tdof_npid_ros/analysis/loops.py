@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.parameters import read_histories
-from tdof_npid_ros.analysis.recording import Surroundings
+from tdof_npid_ros.analysis.recording import Loop, Signal, Surroundings, signal_of
 from tdof_npid_ros.analysis.sources import (
     NOTHING_CHOSEN,
     Chosen,
@@ -90,6 +92,64 @@ def observed_loops(reader: BagReader, bag: str, chosen: Chosen = NOTHING_CHOSEN)
         for roles in _loops(reader, bag, chosen)
         for loop in _observed(reader, Surroundings.read(reader, bag, roles.namespace, histories), roles)
     ]
+
+
+def recorded_loops(reader: BagReader, bag: str, chosen: Chosen = NOTHING_CHOSEN) -> list[Loop]:
+    """The loops in a bag with the messages of our own controller, for what computes its answers again.
+
+    Raises:
+        AnalysisError: no topic can be an output, or the efforts that were chosen are not our controller's.
+        BagError: the bag is damaged.
+    """
+    histories = read_histories(reader)
+    found = []
+    for roles in _loops(reader, bag, chosen):
+        around = Surroundings.read(reader, bag, roles.namespace, histories)
+        topic = _answers_topic(reader, roles.effort)
+        output = roles.output
+        is_signal = _type(reader, output) == JOINT_STATE and output.path.path == "position"
+        found.append(
+            Loop(
+                bag,
+                around.namespace,
+                around.plans,
+                around.plan_times,
+                histories,
+                output.topic,
+                signal_of(reader, output.topic) if is_signal else _as_signal(read_track(reader, output)),
+                topic,
+                signal_of(reader, topic) if topic else None,
+            )
+        )
+    return found
+
+
+def _answers_topic(reader: BagReader, effort: Source | None) -> str:
+    """The topic of our controller's answers; empty where the efforts are another's."""
+    if effort is None:
+        return ""
+    if _type(reader, effort) == JOINT_STATE and effort.path.path == "effort":
+        return effort.topic
+    if effort.told:
+        raise AnalysisError(
+            f"--effort {effort.path}: only our controller's answers can be computed again: {JOINT_STATE}, whose "
+            "frame_id names the parameters"
+        )
+    return ""
+
+
+def _as_signal(track: Track) -> Signal:
+    """A track as if it were a JointState's position."""
+    count = len(track)
+    name, position, nothing = np.empty((3, count), object)
+    for rows in (name, position, nothing):
+        rows[:] = [np.empty(0)] * count
+    for layout in track.layouts:
+        for row, values in zip(layout.rows.tolist(), layout.values, strict=True):
+            position[row] = values
+            name[row] = np.array([key for key in layout.keys if isinstance(key, str)])
+    zeros = np.zeros(count, np.int64)
+    return Signal(track.stamp_ns, track.frame_id, track.receive_ns, zeros, name, position, nothing, nothing)
 
 
 # Which topics

@@ -8,17 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
-from tdof_npid_ros.analysis.errors import AnalysisError
-from tdof_npid_ros.analysis.parameters import ParameterHistory, read_histories
+from tdof_npid_ros.analysis.parameters import ParameterHistory
 from tdof_npid_ros.bag.columns import SEQUENCE
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.names import namespace_of
 from tdof_npid_ros.scenario import Plan, PlanError
-from tdof_npid_ros.wire import JOINT_STATE, SECOND
+from tdof_npid_ros.wire import SECOND
 
 PLAN_AFTER_RESET_NS = 1_000_000_000  # in realtime the scenario says the plan once it has reset the plant
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-_OTHER_SIGNALS = ("setpoint", "control_effort", "disturbance", "controller_state")
 _FIELDS = ("header.stamp", "header.frame_id", "name", "position", "velocity", "effort")
 
 
@@ -123,59 +121,22 @@ class Loop(Surroundings):
     Attributes:
         topic: the output's.
         output: what is controlled; `effort` the effort really applied.
+        effort_topic: the control effort's; empty in a bag without.
         control_effort: the controller's answers; None in a bag without.
     """
 
     topic: str
     output: Signal
+    effort_topic: str
     control_effort: Signal | None
 
 
-def read_loops(reader: BagReader, bag: str) -> list[Loop]:
-    """The loops in a bag: each namespace's `output`, or else any `joint_states`, or else any other JointState.
+def signal_of(reader: BagReader, topic: str) -> Signal:
+    """The messages of a JointState topic.
 
     Raises:
-        AnalysisError: no topic can be an output.
-        BagError: the bag is damaged.
+        BagError: the topic cannot be read.
     """
-    histories = read_histories(reader)
-    return [
-        Loop(
-            bag,
-            namespace,
-            *_plans(reader, f"{namespace}scenario_plan"),
-            histories,
-            topic,
-            _signal(reader, topic),
-            _signal_if_there(reader, f"{namespace}control_effort"),
-        )
-        for topic in _output_topics(reader, bag)
-        for namespace in [namespace_of(topic)]
-    ]
-
-
-def _output_topics(reader: BagReader, bag: str) -> list[str]:
-    signals = [name for name, info in sorted(reader.topics.items()) if info.type == JOINT_STATE and info.count]
-    for wanted in ("output", "joint_states"):
-        found = [name for name in signals if name.rpartition("/")[2] == wanted]
-        if found:
-            return found
-    others = [name for name in signals if name.rpartition("/")[2] not in _OTHER_SIGNALS]
-    if not others:
-        raise AnalysisError(
-            f"{bag}: no output in it, that is no topic of type {JOINT_STATE} but "
-            f"{', '.join(_OTHER_SIGNALS)}: its topics are {', '.join(sorted(reader.topics)) or 'none'}"
-            + "".join(f"; missing: {line}" for line in reader.missing)
-        )
-    return others
-
-
-def _signal_if_there(reader: BagReader, topic: str) -> Signal | None:
-    there = topic in reader.topics and reader.topics[topic].type == JOINT_STATE
-    return _signal(reader, topic) if there else None
-
-
-def _signal(reader: BagReader, topic: str) -> Signal:
     columns = reader.columns(topic, [*_FIELDS, SEQUENCE])
     return Signal(
         columns["header.stamp"],

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
+from tdof_npid_ros.analysis.loops import recorded_loops
 from tdof_npid_ros.analysis.parameters import Configuration, configurations
-from tdof_npid_ros.analysis.recording import Loop, read_loops
+from tdof_npid_ros.analysis.recording import Loop
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.joints import Joints
@@ -107,7 +108,7 @@ def verify(path: str | Path) -> Verification:
         BagError: no bag, or it is damaged.
     """
     with BagReader(path) as reader:
-        loops = [loop for loop in read_loops(reader, str(path)) if loop.control_effort is not None]
+        loops = [loop for loop in recorded_loops(reader, str(path)) if loop.control_effort is not None]
         missing = tuple(reader.missing)
     if not loops:
         raise AnalysisError(f"{path}: no control efforts in it to verify: record the controller's namespace")
