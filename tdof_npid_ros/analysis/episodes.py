@@ -12,17 +12,16 @@ import numpy as np
 
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.loops import ObservedLoop, observed_loops
-from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations
+from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations, scenario_plans
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.analysis.tracks import Key, Track, held, matched
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
-from tdof_npid_ros.parameters import sample_period_in_ns
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.noise import largest_noise
 from tdof_npid_ros.responses import Lane, largest_step
-from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError, parse_plan, read_episodes
+from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
@@ -395,7 +394,7 @@ def _largest_step(
     loop: ObservedLoop, period_ns: int, plant: Mapping[str, object], output: np.ndarray, turn: float, start_ns: int
 ) -> float | None:
     """The largest setpoint step of the scenario, or else of the plans that are in the bag."""
-    plans = _scenario_plans(loop.scenario.at(start_ns)) if loop.scenario is not None else {}
+    plans = scenario_plans(loop.scenario.at(start_ns)) if loop.scenario is not None else {}
     sampled = []
     for plan in plans.values() or loop.plans.values():
         try:
@@ -441,14 +440,5 @@ def plan_names(scenario: ParameterHistory | None, plans: Mapping[str, Plan]) -> 
     """What the scenario calls the plans, by digest."""
     names: dict[str, str] = {}
     for _, values in scenario.sets() if scenario is not None else ():
-        names |= {plan.digest: name for name, plan in _scenario_plans(values).items()}
+        names |= {plan.digest: name for name, plan in scenario_plans(values).items()}
     return {digest: name for digest, name in names.items() if digest in plans}
-
-
-def _scenario_plans(values: Mapping[str, object]) -> dict[str, Plan]:
-    """The plans of a scenario's parameters; none while they come one by one and not all are there."""
-    try:
-        period_ns = sample_period_in_ns(values["sample_period"])
-        return {name: parse_plan(lines, period_ns) for name, lines in read_episodes(values).items()}
-    except (KeyError, ValueError):
-        return {}

@@ -13,10 +13,11 @@ from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains, gains_from_mapping
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
 from tdof_npid_ros.parameters import sample_period_in_ns
+from tdof_npid_ros.scenario import Plan, parse_plan, read_episodes
 
 TOPIC = "/parameter_events"
 # The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.
-_VALUE_FIELDS = {
+VALUE_FIELDS = {
     1: "bool_value",
     2: "integer_value",
     3: "double_value",
@@ -99,6 +100,15 @@ def configurations(histories: Mapping[str, ParameterHistory]) -> dict[str, Confi
 
 
 def _value(value: Mapping[str, Any]) -> Any:
-    field = _VALUE_FIELDS.get(int(value["type"]))
+    field = VALUE_FIELDS.get(int(value["type"]))
     content = value[field] if field else None
     return content.tolist() if isinstance(content, np.ndarray) else content
+
+
+def scenario_plans(values: Mapping[str, object]) -> dict[str, Plan]:
+    """The plans of a scenario's parameters; none while they come one by one and not all are there."""
+    try:
+        period_ns = sample_period_in_ns(values["sample_period"])
+        return {name: parse_plan(lines, period_ns) for name, lines in read_episodes(values).items()}
+    except (KeyError, ValueError):
+        return {}

@@ -8,18 +8,22 @@ controller node.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tdof_npid_ros.analysis.account import Difference, Verification, numbers
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.loops import recorded_loops
 from tdof_npid_ros.analysis.parameters import Configuration, configurations
 from tdof_npid_ros.analysis.recording import Loop
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
+from tdof_npid_ros.analysis.tracks import NAMED_LANE
+from tdof_npid_ros.analysis.verify_messages import check_messages
+from tdof_npid_ros.analysis.verify_plant import check_outputs
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.joints import Joints
@@ -32,89 +36,35 @@ NO_PARAMETERS = "the parameters that they bear the digest of are not in the bag"
 NO_OUTPUT = "the outputs that they answer are not in the bag"
 UNKNOWN_STATE = "the controller's state is not known: the bag lacks earlier answers of the episode"
 OTHER_LANES = "their length is not that of the gains"
+NO_PLAN = "their plan is not in the bag, so the setpoint that they bear is not checked"
+OTHER_NAMES = "they bear other names than the controller gives them"
 
 
-@dataclass(frozen=True)
-class Difference:
-    """An answer that is not what its inputs give.
+def verify(path: str | Path, chosen: Chosen = NOTHING_CHOSEN, law_only: bool = False) -> Verification:
+    """Compute every control effort of a bag again, and check what else can be known of the loop.
 
-    Attributes:
-        what: `control effort`, or `setpoint` for one that is not the plan's.
-        step: index of the answer in the topic.
-        inputs: what went in, by name, for people.
-        recorded, expected: (lanes,).
-    """
-
-    what: str
-    topic: str
-    step: int
-    stamp_ns: int
-    episode: str
-    inputs: Mapping[str, Any]
-    recorded: tuple[float, ...]
-    expected: tuple[float, ...]
-
-    def lines(self) -> list[str]:
-        """The difference for people, numbers in full."""
-        place = (
-            f"{self.topic}, message {self.step}, at {self.stamp_ns / 1e9:.9g} s of {self.episode or 'the recording'}"
-        )
-        return [
-            f"first difference: {self.what} in {place}",
-            *(f"  {name:22} {value}" for name, value in self.inputs.items()),
-            f"  {'recorded':22} {_numbers(self.recorded)}",
-            f"  {'expected':22} {_numbers(self.expected)}",
-        ]
-
-
-@dataclass
-class Verification:
-    """The account of one bag.
-
-    Attributes:
-        equal, different: answers that were computed again.
-        unverifiable: answers that could not be, by reason.
-        missing: what a bag that was cut off lacks, a line for each thing.
-        first: the first difference.
-    """
-
-    bag: str
-    missing: tuple[str, ...] = ()
-    equal: int = 0
-    different: int = 0
-    unverifiable: Counter[str] = field(default_factory=Counter)
-    first: Difference | None = None
-
-    @property
-    def sound(self) -> bool:
-        """Whether something was verified and all of it is equal."""
-        return self.equal > 0 and self.different == 0
-
-    def lines(self) -> list[str]:
-        """The account for people."""
-        found = [f"{self.bag}: {self.equal} control efforts verified bit for bit, {self.different} differ"]
-        found += [f"  {count} not verifiable: {reason}" for reason, count in self.unverifiable.items()]
-        if not self.equal and not self.different:
-            found.append("  nothing was verified")
-        found += [f"  missing: {line}" for line in self.missing]
-        return [*found, *(self.first.lines() if self.first else [])]
-
-
-def verify(path: str | Path) -> Verification:
-    """Compute every control effort of a bag again.
+    Args:
+        chosen: topics of output and control effort, where they are not called so.
+        law_only: check the efforts alone, against the law: nothing of plan and plant.
 
     Raises:
         AnalysisError: there are no control efforts in it.
         BagError: no bag, or it is damaged.
     """
     with BagReader(path) as reader:
-        loops = [loop for loop in recorded_loops(reader, str(path)) if loop.control_effort is not None]
-        missing = tuple(reader.missing)
-    if not loops:
-        raise AnalysisError(f"{path}: no control efforts in it to verify: record the controller's namespace")
-    account = Verification(str(path), missing)
-    for loop in loops:
-        _Replay(loop, account).run()
+        loops = [loop for loop in recorded_loops(reader, str(path), chosen) if loop.control_effort is not None]
+        account = Verification(str(path), tuple(reader.missing))
+        if not loops:
+            raise AnalysisError(
+                f"{path}: no control efforts in it to verify: record the controller's namespace, or name their topic "
+                "with --effort"
+            )
+        for loop in loops:
+            replay = _Replay(loop, account, law_only)
+            replay.run()
+            if not law_only:
+                check_outputs(loop, account)
+                check_messages(reader, loop, replay.terms, account)
     return account
 
 
@@ -133,12 +83,14 @@ class _Answer(NamedTuple):
 class _Replay:
     """A controller that is fed from a bag."""
 
-    def __init__(self, loop: Loop, account: Verification) -> None:
+    def __init__(self, loop: Loop, account: Verification, law_only: bool) -> None:
         assert loop.control_effort is not None
+        self._law_only = law_only
+        self.terms: dict[int, list[np.ndarray]] = defaultdict(list)  # of the verified answers, by stamp
         self._loop = loop
         self._answers = loop.control_effort
         self._account = account
-        self._topic = f"{loop.namespace}control_effort"
+        self._topic = loop.effort_topic
         self._configurations = configurations(loop.histories)
         self._session: Session | None = None
         self._known = False  # whether the controller's state is that of the recorded one
@@ -177,12 +129,30 @@ class _Replay:
         expected = self._answer_again(self._session_with(configuration), answer, place, y, r)
         if not self._known:
             self._account.unverifiable[UNKNOWN_STATE] += 1
-        elif expected.tobytes() != u.tobytes():
+            return
+        assert self._session is not None
+        self.terms[answer.stamp_ns].append(self._session.controller.terms.copy())
+        planned = None if self._law_only else self._planned(answer, len(r))
+        if expected.tobytes() != u.tobytes():
             self._differs("control effort", answer, y, r, u, expected)
-        elif (planned := self._planned(answer, len(r))) is not None and planned.tobytes() != r.tobytes():
+        elif planned is not None and planned.tobytes() != r.tobytes():
             self._differs("setpoint", answer, y, r, r, planned)
+        elif planned is None and not self._law_only and answer.episode is not None and answer.episode.plan:
+            self._account.unverifiable[NO_PLAN] += 1
+        elif not self._law_only and (wrong := self._wrong_names(answer, len(r))):
+            self._account.unverifiable[wrong] += 1
         else:
             self._account.equal += 1
+
+    def _wrong_names(self, answer: _Answer, lanes: int) -> str:
+        """Why an answer to our plant bears other names than its controller gives; empty if it does not."""
+        if answer.episode is None or self._loop.controller is None:
+            return ""
+        values = self._loop.controller.at(int(self._answers.publish_ns[answer.step]))
+        given = [name for name in values.get("joint_names", ()) if name]
+        names = [str(name) for name in self._answers.name[answer.step]]
+        allowed: tuple[list[str], ...] = ([], given or [f"{NAMED_LANE}{lane}" for lane in range(lanes)])
+        return "" if names in allowed else OTHER_NAMES
 
     @staticmethod
     def _obstacle(configuration: Configuration | None, y: np.ndarray | None, r: np.ndarray) -> str | None:
@@ -242,9 +212,13 @@ class _Replay:
             return
         assert self._session is not None
         controller = self._session.controller
-        inputs: dict[str, Any] = {"setpoint": _numbers(r), "output": _numbers(y), "parameters": answer.digest}
+        inputs: dict[str, Any] = {
+            "setpoint": numbers(r.tolist()),
+            "output": numbers(y.tolist()),
+            "parameters": answer.digest,
+        }
         inputs |= controller.gains.as_dict() | controller.options.as_dict()
-        inputs |= {term: _numbers(row) for term, row in zip(TERMS, controller.terms, strict=True)}
+        inputs |= {term: numbers(row.tolist()) for term, row in zip(TERMS, controller.terms, strict=True)}
         self._account.first = Difference(
             what,
             self._topic,
@@ -281,7 +255,3 @@ def _answers(loop: Loop) -> Iterator[_Answer]:
         follows = not sequence or sequence == before + 1
         yield _Answer(step, stamp, digest, label, latest if candidates else -1, new_publisher, follows)
         before = sequence
-
-
-def _numbers(values: Any) -> str:
-    return ", ".join(float(value).hex() + f" ({float(value)!r})" for value in values)

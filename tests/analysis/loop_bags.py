@@ -13,6 +13,7 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.plants.plant import plant_at_start
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -107,6 +108,10 @@ class LoopBag:
     def episode(self, case: Case, gains: Gains, name: str, number: int, lost: Sequence[int] = ()) -> None:
         """One lockstep episode; outputs and answers of the steps `lost` are missing."""
         plan, run = case.plans[name], case.simulate(name, gains)
+        applied = np.clip(np.roll(run.control_effort, 1, axis=0), *case.effort_limits)
+        applied[0] = plant_at_start(
+            case.plant_at, plan.start, case.signals[name].segments[0].plant, case.effort_limits
+        ).initial_effort
         digest = parameters_digest(gains, case.sample_period_ns, case.options)
         frame = f"{plan.digest}/{number}"
         self.write("scenario_plan", TRAJECTORY, plan_message(plan))
@@ -115,7 +120,7 @@ class LoopBag:
             if k in lost:
                 self.skip("output"), self.skip("control_effort")
                 continue
-            self.write("output", JOINT_STATE, joint_state(stamp, frame, run.output[k], run.control_effort[k - 1]))
+            self.write("output", JOINT_STATE, joint_state(stamp, frame, run.output[k], applied[k]))
             setpoint = np.full(gains.lanes, run.setpoint[k])
             answer = joint_state(stamp, f"{digest} {frame}", setpoint, run.control_effort[k])
             self.write("control_effort", JOINT_STATE, answer)
