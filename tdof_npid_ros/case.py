@@ -21,8 +21,7 @@ from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspe
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
 from tdof_npid_ros.plants.noise import largest_noise, noiseless
 from tdof_npid_ros.plants.plant import Plant
-from tdof_npid_ros.plants.start import plant_at_start
-from tdof_npid_ros.responses import largest_step
+from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
 Bounds = tuple[float, float]
@@ -107,6 +106,16 @@ class Case:
             steps.append(float(np.abs(np.diff(signals.setpoint, prepend=first)).max()))
         return max(steps)
 
+    @cached_property
+    def largest_move(self) -> float:
+        """As `largest_step`, but a ramp or sine counts as far as it goes, and an angle by the shorter way: what the
+        band of the recovery is a fraction of."""
+        moves = [0.0]
+        for signals in self.signals.values():
+            first = self.plant.initial_output if signals.start is None else signals.start
+            moves.append(largest_move(signals.setpoint, first, self.options.turn))
+        return max(moves)
+
     def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
         """Run an episode in process; gains for one lane or many, by default the case's.
 
@@ -153,22 +162,7 @@ class Case:
             raise _no_single_step(
                 self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
             )
-        return disturbance_metrics(y, setpoint, self.sample_period, self.largest_setpoint_step, self.options.turn)
-
-    @cached_property
-    def largest_setpoint_step(self) -> float:
-        """Of all episodes, the first step of each from the output at its start; 0 where the setpoint never steps."""
-        steps = [
-            largest_step(
-                signals.setpoint,
-                plant_at_start(
-                    self.plant_at, signals.start, signals.segments[0].plant, self.effort_limits
-                ).initial_output,
-                self.options.turn,
-            )
-            for signals in self.signals.values()
-        ]
-        return max(steps, default=0.0)
+        return disturbance_metrics(y, setpoint, self.sample_period, self.largest_move, self.options.turn)
 
     def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float, float]:
         """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start

@@ -104,7 +104,7 @@ def responses(lane: Lane) -> list[Response]:
     return [_measured(lane, change, max(end, change.at)) for change, end in zip(changes, [*ends, last], strict=True)]
 
 
-def largest_step(setpoint: np.ndarray, start: float, turn: float = 0.0) -> float:
+def largest_move(setpoint: np.ndarray, start: float, turn: float = 0.0) -> float:
     """The largest step that a plan's setpoint (samples,) makes, the first one from the output at the start.
 
     A ramp or sine counts as one step, as far as it goes.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tdof_npid_ros.responses import Lane, largest_step, responses
+from tdof_npid_ros.responses import Lane, largest_move, responses
 from tdof_npid_ros.scenario import parse_plan
 
 PERIOD_NS = 10_000_000
@@ -29,11 +29,11 @@ def lane(setpoint: np.ndarray, output: np.ndarray, disturbance: np.ndarray | Non
 )
 def test_the_largest_step_of_a_plan(lines, start, size) -> None:
     setpoint = parse_plan(lines, PERIOD_NS).sampled(PERIOD_NS).setpoint
-    assert largest_step(setpoint, start) == pytest.approx(size, rel=1e-3)
+    assert largest_move(setpoint, start) == pytest.approx(size, rel=1e-3)
 
 
 def test_the_largest_step_of_angles_is_the_shorter_way() -> None:
-    assert largest_step(np.array([3.0, 3.0, -3.0]), 3.0, 2 * np.pi) == pytest.approx(2 * np.pi - 6)
+    assert largest_move(np.array([3.0, 3.0, -3.0]), 3.0, 2 * np.pi) == pytest.approx(2 * np.pi - 6)
 
 
 def test_a_disturbance_while_the_setpoint_stands_is_a_disturbance() -> None:

@@ -20,7 +20,7 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.noise import largest_noise
-from tdof_npid_ros.responses import Lane, largest_step
+from tdof_npid_ros.responses import Lane, largest_move
 from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
@@ -402,7 +402,7 @@ def _largest_step(
         except PlanError:
             continue  # shorter than a sample
     start = _initial_output(plant, output)
-    sizes = [largest_step(plan.setpoint, start if plan.start is None else plan.start, turn) for plan in sampled]
+    sizes = [largest_move(plan.setpoint, start if plan.start is None else plan.start, turn) for plan in sampled]
     return max(sizes, default=None)
 
 

@@ -13,7 +13,7 @@ from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.controller import parameters_digest
 from tdof_npid_ros.control.gains import Gains
-from tdof_npid_ros.plants.plant import plant_at_start
+from tdof_npid_ros.plants.start import plant_at_start
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"

@@ -107,7 +107,7 @@ def test_a_tank_is_measured_from_the_level_at_which_it_begins(folder) -> None:
     metrics = case.setpoint_response()
     assert y[0] == 1.0
     assert metrics.overshoot_percent == pytest.approx(100 * (y.max() - 1.5) / 0.5)
-    assert case.largest_setpoint_step == 0.5
+    assert case.largest_move == 0.5
     outside = abs(y - 1.5) > 0.05 * 0.5
     assert metrics.settling_time_s == pytest.approx((outside.nonzero()[0][-1] + 1) * 0.01)
 
