@@ -15,6 +15,8 @@ from tdof_npid_ros.stability.screen import DEEPEST, MOST_POINTS, frequency_grid,
 
 RIGHT = 1.0  # rad: most that the function may turn between two points of a count
 SURE = 1e-6  # relative, in that distance: within which an estimate is confirmed
+NEAREST = 1e-15  # distance of a mode to the circle, below which it counts as on it
+FARTHEST = 1.0 - 1e-9  # inside the circle: modes nearer to z = 0 die out at once
 CLOSE = 1e-9  # relative, in the distance to the circle: how near the slowest mode is found
 
 
@@ -85,22 +87,19 @@ class Characteristic:
             low, high = guess - SURE * abs(guess), guess + SURE * abs(guess)
             if low > -1.0 and self._outside(low) and not self._outside(high):
                 return guess
-        if self._outside(0.0):
-            low, high = 0.0, 1e-6
-            while self._outside(high):
-                low, high = high, 8.0 * high
-        else:
-            low, high = -1e-6, 0.0
-            while low > -1.0 and not self._outside(low):
-                low, high = max(8.0 * low, -1.0), low
-            if low == -1.0:
-                low = -1.0 + 1e-9
-        while high - low > CLOSE * max(abs(low), abs(high)) and high - low > 1e-15:
-            middle = 0.5 * (low + high)
-            if low < 0.0 and high <= 0.0 and low < 8.0 * high:
-                middle = -math.sqrt(low * high)
-            low, high = (middle, high) if self._outside(middle) else (low, middle)
-        return 0.5 * (low + high)
+        grows = self._outside(0.0)
+        sign = 1.0 if grows else -1.0
+        near, far = NEAREST, 1e-6  # distances to the circle: the mode lies beyond the one, not beyond the other
+        if self._outside(sign * near) != grows:
+            return 0.0 if grows else -near
+        while self._outside(sign * far) == grows:
+            if not grows and far == FARTHEST:
+                return -far
+            near, far = far, 8.0 * far if grows else min(8.0 * far, FARTHEST)
+        while far > near * (1.0 + CLOSE):
+            middle = math.sqrt(near * far)
+            near, far = (middle, far) if self._outside(sign * middle) == grows else (near, middle)
+        return sign * math.sqrt(near * far)
 
     def _outside(self, beyond: float) -> bool:
         """Whether there is a mode outside the circle, or on it."""

@@ -17,6 +17,8 @@ from tdof_npid_ros.stability.plant import OperatingPoint, loop_plant, operating_
 from tdof_npid_ros.stability.pulse import PulseTransfer
 from tdof_npid_ros.stability.screen import Screen
 
+ON_BORDER = 1e-12  # distance of a mode to the circle, below which nobody can tell on which side it lies
+
 
 @dataclass(frozen=True)
 class Margins:
@@ -131,9 +133,8 @@ def linear_margins(plant: PulseTransfer, gains: Gains) -> Margins:
         return Margins(None, "the effort does not move the output at this point")
     h, stable = plant.sample_period, bool(screened.stable[0])
     beyond = loop.radius(math.expm1(-h / float(screened.time_constant[0])) if stable else None)
-    rate = math.log1p(beyond) / h
-    time_constant = -1.0 / rate if rate else None
-    if not stable or beyond >= 0.0:
+    time_constant = -h / math.log1p(beyond) if abs(beyond) > ON_BORDER else None
+    if not stable or beyond >= -ON_BORDER:
         return Margins(False, _unstable(beyond, h), spectral_radius=1.0 + beyond, time_constant_s=time_constant)
     delay = _limited(screened.delay_margin[0])
     phase = _limited(screened.phase_margin[0])
@@ -171,7 +172,7 @@ def _limited(value: float) -> float | None:
 
 
 def _unstable(beyond: float, h: float) -> str:
-    if beyond <= 0.0:
+    if beyond <= ON_BORDER:
         return "a mode lies on the border of stability: what remains neither grows nor dies out"
     return f"the loop is unstable: deviations grow by e every {h / math.log1p(beyond):.4g} s"
 

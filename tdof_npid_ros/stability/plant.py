@@ -55,6 +55,7 @@ def operating_point(
     r, d = (
         told if told is not None else usual for told, usual in zip((setpoint, disturbance), _usual(case), strict=True)
     )
+    r = min(max(r, case.options.setpoint_min), case.options.setpoint_max)
     plant = case.plant
     if isinstance(plant, TransferFunction):
         return _linear_point(plant, case, gains, r, d)

@@ -231,3 +231,22 @@ def test_the_plant_s_own_operating_point_changes_no_margin() -> None:
     moved = case_of({**FIRST_ORDER, "output_offset": 20.0, "effort_offset": 3.0}, Gains("pid", 1.0, 1.0))
     assert loop_plant(plain) == loop_plant(moved)
     assert operating_point(moved, moved.gains, 25.0, 0.0).effort == pytest.approx(8.0)
+
+
+def test_a_mode_so_near_the_border_that_nobody_can_tell_is_not_called_stable() -> None:
+    for gains, plant in (
+        (Gains("pid", 1.0, 1e-12), {"model": "first_order", "time_constant": 1.0, "dead_time": 0.1}),
+        (
+            Gains("pid", 0.5, 0.2),
+            {"model": "transfer_function", "numerator": [1.0, 0.0], "denominator": [1.0, 2.0, 1.0]},
+        ),
+    ):
+        case = case_of(plant, gains)
+        found = margins(case, gains)
+        assert found.stable is False and "border" in str(found.reason)
+        assert found.time_constant_s is None and found.spectral_radius == pytest.approx(1.0)
+
+
+def test_the_setpoint_s_own_limits_move_the_operating_point() -> None:
+    case = case_of(FIRST_ORDER, Gains("pid", 1.0, 1.0), setpoint_max=0.5)
+    assert operating_point(case, case.gains, 2.0, 0.0).output == 0.5
