@@ -72,7 +72,7 @@ class Report:
 
     Attributes:
         episodes: of all bags, in the order of the bags and of time.
-        missing: what bags that were cut off lack, a line for each thing.
+        missing: what bags that were cut off lack, and what cannot be decoded, a line for each thing.
     """
 
     episodes: tuple[EpisodeReport, ...]
@@ -176,7 +176,7 @@ def analyze(paths: Iterable[str | Path], chosen: Chosen = NOTHING_CHOSEN) -> Rep
     for path in paths:
         with BagReader(path) as reader:
             episodes += map(_report, episodes_in(reader, path, chosen))
-            missing += reader.missing
+            missing += [*reader.missing, *reader.left_out]
     return Report(tuple(episodes), tuple(missing))
 
 

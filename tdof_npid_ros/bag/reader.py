@@ -30,6 +30,7 @@ LAST_NS: Final = 2**63 - 1
 
 _MAX_OPEN_BYTES: Final = 1 << 30  # of pieces that overlap in time, read at once to put their messages in order
 _ROWS_AT_ONCE: Final = 1 << 14  # of a piece, as Python objects
+_MOST_LINES: Final = 20  # of an account
 _FIRST_MESSAGES: Final = 1000  # among which one may lie far before the rest
 _LONG_BEFORE_NS: Final = 60 * 10**9
 
@@ -97,6 +98,17 @@ class BagReader:
             except BagError as error:
                 reasons[name] = str(error)
         return reasons
+
+    @property
+    def left_out(self) -> list[str]:
+        """A line for each topic that cannot be decoded, or has lost messages so, as far as it was read."""
+        lines = [f"{self.topics[name].count} messages: {reason}" for name, reason in self.unreadable.items()]
+        lines += [
+            f"{skipped.count} messages of topic {shown(name)} cannot be decoded: {skipped.reason}"
+            for name, skipped in self.skipped.items()
+        ]
+        more = len(lines) - _MOST_LINES
+        return [*lines[:_MOST_LINES], f"and {more} more topics"] if more > 0 else lines
 
     @property
     def truncated(self) -> bool:
