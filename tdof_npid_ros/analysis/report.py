@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from tdof_npid_ros.analysis.loop_margins import episode_margins
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
+from tdof_npid_ros.parameters import NOISE, PLANT
+from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
 from tdof_npid_ros.stability.margins import Margins
 
@@ -81,15 +84,17 @@ class Report:
     def rows(self) -> list[dict[str, Any]]:
         """One row per response, by the names of `COLUMNS`; None where there is no such number."""
         names = bag_names(report.episode.bag for report in self.episodes)
-        rows = [row for report in self.episodes for row in _rows(report, names[report.episode.bag])]
+        rows: list[dict[str, Any]] = []
         first: dict[tuple[Any, ...], float] = {}
-        for row in rows:
-            same = (row["episode"].partition(" #")[0], row["lane"], row["response"], row["start_s"])
-            if row["iae"] is None:
-                continue
-            if same in first and first[same] > 0:
-                row["iae_change_percent"] = 100.0 * (row["iae"] / first[same] - 1.0)
-            first.setdefault(same, row["iae"])
+        for report in self.episodes:
+            mine = _rows(report, names[report.episode.bag])
+            rows += mine
+            for row, same in zip(mine, _alike(report), strict=True):
+                if row["iae"] is None or same is None:
+                    continue
+                if same in first and first[same] > 0:
+                    row["iae_change_percent"] = 100.0 * (row["iae"] / first[same] - 1.0)
+                first.setdefault(same, row["iae"])
         return rows
 
     def table(self) -> str:
@@ -211,6 +216,29 @@ def _causes(report: EpisodeReport) -> Iterator[tuple[str, int | None]]:
             yield f"no margins: {loop.reason}", lane
     if report.deviation.reason and episode.plan is not None:
         yield f"not compared with the simulation: {report.deviation.reason}", None
+
+
+def _alike(report: EpisodeReport) -> Iterator[tuple[Any, ...] | None]:
+    """Yield, for each row, what it has in common with rows that it may be compared with: plant, plan, lane and
+    response. None where the bag does not tell plant and plan."""
+    episode = report.episode
+    known = episode.followed and episode.plant
+    plant = tuple(sorted((name, repr(value)) for name, value in episode.plant.items() if name in _of_plant(episode)))
+    for lane, found in enumerate(report.responses):
+        counts: Counter[str] = Counter()
+        for response in found:
+            counts[response.kind] += 1
+            key = (episode.followed, episode.sample_period_ns, plant, lane, response.kind, counts[response.kind])
+            yield key if known else None
+
+
+def _of_plant(episode: Episode) -> Collection[str]:
+    """The parameters that make the plant what it is, without those of how it is run."""
+    try:
+        parameters = set(model_parameters(str(episode.plant.get("model"))))
+    except ValueError:
+        parameters = set(episode.plant) - set(PLANT)
+    return {"model", "effort_min", "effort_max", *NOISE, *parameters}
 
 
 def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:

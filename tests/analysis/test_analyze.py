@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import chromium_page
-from loop_bags import JOINT_STATE, START_NS, STEP_NS, TYPES, LoopBag, joint_state
+from loop_bags import JOINT_STATE, START_NS, STEP_NS, TRAJECTORY, TYPES, LoopBag, joint_state, plan_message
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
@@ -21,6 +21,7 @@ from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import main
+from tdof_npid_ros.control.controller import parameters_digest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PNG = b"\x89PNG"
@@ -304,3 +305,46 @@ def test_the_page_fits_a_phone(bag, tmp_path) -> None:
         page.goto(page_file.as_uri())
         page.wait_for_function("Bokeh.documents.length && Bokeh.documents[0].is_idle")
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_bags_of_other_plants_or_plans_are_not_compared(bag, tmp_path, case) -> None:
+    slower = replace(case, plant_values={**case.plant_values, "time_constant": 6.0})
+    higher = replace(case, episodes={"setpoint": ("0 setpoint 2", "25 end")})
+    for name, other in (("slower", slower), ("higher", higher)):
+        with LoopBag(tmp_path / name) as writer:
+            writer.configuration(other, case.gains)
+            writer.episode(other, case.gains, "setpoint", 1)
+    report = analyze([bag, tmp_path / "slower", tmp_path / "higher"])
+    assert [row["iae_change_percent"] for row in report.rows()] == [None] * 4
+
+
+def test_notes_name_their_bag(bag, tmp_path) -> None:
+    with LoopBag(tmp_path / "robot") as writer:
+        for k in range(100):
+            writer.write("joint_states", JOINT_STATE, joint_state(10**9 + 10**7 * k, "base_link", [0.1 * k]))
+    assert any(
+        note.startswith("robot recording #1: response to tracking")
+        for note in analyze([bag, tmp_path / "robot"]).notes()
+    )
+
+
+def test_a_realtime_run_of_a_plan_is_the_same_episode_as_one_in_lockstep(bag, tmp_path, case) -> None:
+    """Its outputs bear no plan, but the scenario says which one it plays, just after the plant's reset."""
+    run, plan = case.simulate("setpoint"), case.plans["setpoint"]
+    with LoopBag(tmp_path / "realtime") as writer:
+        writer.configuration(case, case.gains)
+        for k in range(1001):
+            if k == 3:
+                writer.write("scenario_plan", TRAJECTORY, plan_message(plan))
+            label, stamp = "-/0011aabb.2", START_NS + k * case.sample_period_ns
+            writer.write("output", JOINT_STATE, joint_state(stamp, label, run.output[k], [0.0]))
+            digest = parameters_digest(case.gains, case.sample_period_ns)
+            answer = joint_state(stamp, f"{digest} {label}", [run.setpoint[k]], run.control_effort[k])
+            writer.write("control_effort", JOINT_STATE, answer)
+    report = analyze([bag, tmp_path / "realtime"])
+    names = [one.episode.name for one in report.episodes]
+    assert names == ["setpoint", "disturbance", "setpoint"]
+    assert [row["iae_change_percent"] is None for row in report.rows()] == [True, True, False]
+    (response,) = report.episodes[2].responses[0]
+    assert response.kind == "setpoint" and response.start_s == 0.0
+    assert response.metrics.overshoot_percent == case.setpoint_response().overshoot_percent
