@@ -474,6 +474,9 @@ REPLAY: Final = table(
     Parameter("loop", False, "begin again at the end", fixed=True),
     Parameter("clock", False, "publish /clock, as recorded, else the time of recording", fixed=True),
     Parameter("compare", False, "compare a live controller's efforts with the recorded", fixed=True),
+    Parameter("output", "", "compare: the topic of the outputs, where it is not called so", fixed=True),
+    Parameter("setpoint", "", "compare: the topic of the setpoints, where it is not called so", fixed=True),
+    Parameter("effort", "", "compare: the topic of the recorded efforts, where it is not control_effort", fixed=True),
     AUTOSTART,
 )
 

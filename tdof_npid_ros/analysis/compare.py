@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.loops import recorded_loops
 from tdof_npid_ros.analysis.recording import Loop
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen, resolved
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.names import in_namespace
-from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel, SignalReader
+from tdof_npid_ros.wire import JOINT_STATE, AnswerLabel, EpisodeLabel, SignalReader
 
 Key = tuple[EpisodeLabel | None, int]  # episode and stamp in ns
 
@@ -25,21 +27,27 @@ class Recorded:
     Attributes:
         namespace: of the loop; ends with a slash.
         output: the topic that it answered.
+        setpoint: the topic that it took its setpoints from.
         answers: by episode and stamp: digest of the parameters, and effort, (lanes,).
     """
 
     namespace: str
     output: str
+    setpoint: str
     answers: Mapping[Key, tuple[str, np.ndarray]]
 
     @classmethod
-    def read(cls, reader: BagReader, bag: str) -> Recorded:
+    def read(cls, reader: BagReader, bag: str, chosen: Chosen = NOTHING_CHOSEN) -> Recorded:
         """The answers in a bag.
 
+        Args:
+            chosen: topics of output, setpoint and effort, where they are not called so.
+
         Raises:
+            AnalysisError: what was chosen is not there, or is no signal that a controller takes.
             BagError: there are none, or several controllers', or the bag is damaged.
         """
-        loops = [loop for loop in recorded_loops(reader, bag) if loop.control_effort is not None]
+        loops = [loop for loop in recorded_loops(reader, bag, chosen) if loop.control_effort is not None]
         recorder_namespace = in_namespace(reader.custom_data.get("namespace", "/"))
         loops = [loop for loop in loops if loop.namespace == recorder_namespace] or loops
         if not loops:
@@ -48,7 +56,12 @@ class Recorded:
             topics = ", ".join(loop.topic for loop in loops)
             raise BagError(f"{bag}: several loops in it, {topics}: record the one to compare by itself")
         (loop,) = loops
-        return cls(loop.namespace, loop.topic, _answers(loop))
+        if reader.topics[loop.topic].type != JOINT_STATE:
+            raise AnalysisError(f"{bag}: {loop.topic} is no {JOINT_STATE}, which a controller takes as its output")
+        setpoint = in_namespace(loop.namespace, "setpoint")
+        if chosen.setpoint is not None:
+            setpoint = resolved(reader, bag, "setpoint", chosen.setpoint).topic
+        return cls(loop.namespace, loop.topic, setpoint, _answers(loop))
 
     def key(self, output: bytes) -> Key | None:
         """Episode and stamp of a serialized output, if the recorded controller answered it."""

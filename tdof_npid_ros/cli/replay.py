@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 
+from tdof_npid_ros.cli.choice import add_choice, choice
 from tdof_npid_ros.graph.replay_node import replay
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.parameters import REPLAY
@@ -28,11 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="give the recorded outputs to a live controller, as fast as it answers, and compare its efforts; "
         "0 if they are equal, or differ because its parameters do",
     )
+    add_choice(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay to the end, or to Ctrl-C."""
     parameters = {name: getattr(arguments, name) for name in ("bag", "rate", "start", "loop", "clock", "compare")}
+    chosen = choice(arguments)
+    for role in ("output", "setpoint", "effort"):
+        if (path := getattr(chosen, role)) is not None:
+            parameters[role] = str(path)
     namespace = in_namespace(arguments.namespace).rstrip("/") or "/"
     if not re.fullmatch(r"/|(/[A-Za-z_]\w*)+", namespace, re.ASCII):
         raise ValueError(

@@ -15,7 +15,9 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
+from tdof_npid_ros.analysis import AnalysisError
 from tdof_npid_ros.analysis.compare import Comparison, Key, Recorded
+from tdof_npid_ros.analysis.sources import Chosen
 from tdof_npid_ros.bag import BagError
 from tdof_npid_ros.bag.reader import BagReader, Message
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS
@@ -31,10 +33,11 @@ from tdof_npid_ros.wire import SECOND, AnswerLabel, Sample
 
 CLOCK = "/clock"
 NOT_REPLAYED = ("/parameter_events", "/rosout", "/diagnostics", CLOCK)  # they tell of the nodes that run now
-FOR_CONTROLLER = ("scenario_plan", "setpoint")  # what a controller is given, besides the output
+SCENARIO_PLAN = "scenario_plan"  # what a controller is given, besides output and setpoint
 MATCH_TIMEOUT = 10.0  # s until subscribers must have come, where an answer is needed
 REPLY_TIMEOUT = 0.5  # s until an output is published again
 RETRIES = 20
+PROGRESS_PERIOD = 10.0  # s of wall time between two words about how far it is
 
 
 class ReplayNode(LoopNode):
@@ -54,9 +57,10 @@ class ReplayNode(LoopNode):
         self.accept_changes()
         try:
             self.reader = BagReader(self.bag)
-            self.recorded = Recorded.read(self.reader, str(self.bag)) if self.compare else None
+            chosen = Chosen.read(*(given[role] or None for role in ("output", "setpoint", "effort")))
+            self.recorded = Recorded.read(self.reader, str(self.bag), chosen) if self.compare else None
             self.begin_ns = self.reader.begin_ns
-        except BagError as error:
+        except (AnalysisError, BagError) as error:
             raise ValueError(str(error)) from None
         if self.begin_ns > self.reader.start_ns:
             before = (self.begin_ns - self.reader.start_ns) / SECOND
@@ -91,7 +95,7 @@ class ReplayNode(LoopNode):
 
     def _topics(self) -> list[str]:
         if self.recorded is not None:
-            given = {self.recorded.output, *(self.recorded.namespace + name for name in FOR_CONTROLLER)}
+            given = {self.recorded.output, self.recorded.setpoint, self.recorded.namespace + SCENARIO_PLAN}
             return [topic for topic in self.reader.topics if topic in given]
         return [topic for topic in self.reader.topics if topic not in NOT_REPLAYED and "transition_event" not in topic]
 
@@ -136,15 +140,23 @@ class ReplayNode(LoopNode):
 
     def _play_through(self) -> None:
         first_ns = self.begin_ns + round(self.start * SECOND)
-        began = time.monotonic()
+        began = self.told = time.monotonic()
         for topic, log_ns, _, data in self._messages(first_ns):
-            if self.recorded is None:
-                due = began + (log_ns - first_ns) / SECOND / self.rate
-                if self.stopping.wait(max(0.0, due - time.monotonic())):
-                    return
+            due = began + (log_ns - first_ns) / SECOND / self.rate if self.recorded is None else 0.0
+            while not self.stopping.wait(min(max(0.0, due - time.monotonic()), PROGRESS_PERIOD)):
+                self._tell_progress(log_ns)
+                if time.monotonic() >= due:
+                    break
             self._publish(topic, log_ns, bytes(data))
             if self.stopping.is_set():
                 return
+
+    def _tell_progress(self, log_ns: int) -> None:
+        """Say now and then how far it is; the message logged at `log_ns` is the next one."""
+        if time.monotonic() - self.told > PROGRESS_PERIOD:
+            self.told = time.monotonic()
+            passed, whole = ((ns - self.begin_ns) / SECOND for ns in (log_ns, self.reader.end_ns))
+            self.get_logger().info(f"at {passed:.1f} of {whole:.1f} s, {self.counts['published']} messages published")
 
     def _messages(self, first_ns: int) -> Iterator[Message]:
         """From a time on; before it, what a latecomer would still be given, and first messages far before the rest."""

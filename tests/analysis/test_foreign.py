@@ -25,8 +25,10 @@ from foreign_bags import (
 )
 
 from tdof_npid_ros.analysis import AnalysisError
+from tdof_npid_ros.analysis.compare import Recorded
 from tdof_npid_ros.analysis.report import Report, analyze
 from tdof_npid_ros.analysis.sources import Chosen
+from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.metrics import SetpointMetrics
 from tdof_npid_ros.responses import Response
@@ -378,3 +380,15 @@ def test_a_bag_is_not_changed_by_being_read(tmp_path) -> None:
     before = {file: file.read_bytes() for file in Path(bag).iterdir()}
     analyze([bag])
     assert {file: file.read_bytes() for file in Path(bag).iterdir()} == before
+
+
+def test_the_loop_to_compare_a_live_controller_with_may_be_named(tmp_path) -> None:
+    efforts = [
+        (t + 1000, "/arm/u", JOINT_STATE, joints({"a": 1.0}, START_NS + t, effort=[0.5])) for t in range(0, 10**9, H_NS)
+    ]
+    bag = write(tmp_path / "bag", measured({"a": STEP}, 1.0, topic="/arm/measured") + efforts)
+    with BagReader(bag) as reader:
+        recorded = Recorded.read(reader, str(bag), Chosen.read("/arm/measured", "/arm/measured", "/arm/u"))
+        assert (recorded.output, recorded.setpoint, len(recorded.answers)) == ("/arm/measured", "/arm/measured", 100)
+        with pytest.raises(AnalysisError, match="no topic /arm/v"):
+            Recorded.read(reader, str(bag), Chosen.read("/arm/measured", None, "/arm/v"))
