@@ -12,6 +12,7 @@ from tdof_npid_ros.bag import metadata
 from tdof_npid_ros.bag.errors import BagError, choices, shown
 
 SQLITE: Final = ".db3"
+_MOST_LINES: Final = 50  # about files that are not read
 _SUFFIXES: Final = (".mcap", SQLITE)
 
 
@@ -105,4 +106,5 @@ def _listed_files(path: Path, names: list[str]) -> tuple[tuple[Path, ...], list[
             f"{where} {choices(names)}, and none of them is there to be read: it holds {choices(there)};"
             f" delete {metadata.FILE_NAME} to open what is there"
         )
-    return tuple(files), absent
+    more = len(absent) - _MOST_LINES
+    return tuple(files), [*absent[:_MOST_LINES], f"{where} {more} more that are not read"] if more > 0 else absent

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +37,7 @@ _CHAIN: Final = 3  # records in a row that must fit before one that was found is
 _MOST_CANDIDATES: Final = 1 << 20  # places looked at for a record that fits
 _MOST_INDEX_BYTES: Final = 16 << 20  # of one message index
 _MAX_PADDING: Final = 16  # bytes that some writers put after a record's last field
+_MOST_LINES: Final = 500  # of the account of one file
 _DATA_END_BYTES: Final = 4
 _CHECKED: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE_INDEX, Opcode.DATA_END)
 
@@ -61,7 +63,7 @@ class SalvagedFile(McapFile):
         self.lost: Counter[str] = Counter()
         self.lost_by = ""
         self._chunk_indexes: dict[int, ChunkIndex] = {}
-        self._known: set[int] = set()  # where records begin, by the indexes
+        self._known: list[int] = []  # where records begin, by the indexes
         self._chunk_ends: dict[int, int] = {}  # of the chunks at these places
         self._message_indexes: dict[int, list[tuple[int, int, int]]] = {}  # channel, place, messages, by span offset
         self._lost_spans: list[Span] = []
@@ -112,6 +114,7 @@ class SalvagedFile(McapFile):
     # The walk from the front, and how it goes on after damage
 
     def _walk(self) -> int:
+        self._known.sort()
         position = len(records.MAGIC)
         while position < self._limit:
             try:
@@ -161,7 +164,8 @@ class SalvagedFile(McapFile):
         if self._take_by_own_sizes(position):
             self.mended.append(f"{self.path}: {self._plain(str(error))}; read by the size of its data")
             return self._chunk_ends[position]
-        known = min((place for place in self._known if place > position), default=self._limit)
+        after = bisect_right(self._known, position)
+        known = self._known[after] if after < len(self._known) else self._limit
         found = next(self._fitting(position + 1, known), None)
         following, how = (known, "an index") if found is None else (found, "what fits")
         if following >= self._limit:
@@ -289,11 +293,11 @@ class SalvagedFile(McapFile):
         if opcode == Opcode.CHUNK_INDEX:
             index = records.read(ChunkIndex, content, where)
             self._chunk_indexes[index.chunk_start_offset] = index
-            self._known |= {index.chunk_start_offset, *index.message_index_offsets.values()}
+            self._known += (index.chunk_start_offset, *index.message_index_offsets.values())
         elif opcode == Opcode.METADATA_INDEX:
-            self._known.add(records.read(MetadataIndex, content, where).offset)
+            self._known.append(records.read(MetadataIndex, content, where).offset)
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            self._known.add(records.read(AttachmentIndex, content, where).offset)
+            self._known.append(records.read(AttachmentIndex, content, where).offset)
 
     def _note(self, opcode: int, position: int, length: int, head: bytes) -> None:
         super()._note(opcode, position, length, head)
@@ -400,7 +404,9 @@ class SalvagedFile(McapFile):
         self.dropped_bytes += size
 
     def _miss(self, line: str) -> None:
-        if line not in self.missing:
+        if len(self.missing) == _MOST_LINES:
+            self.missing.append(f"{self.path}: there is more damage than is listed here")
+        if len(self.missing) < _MOST_LINES and line not in self.missing:
             self.missing.append(line)
 
     def _plain(self, why: str) -> str:

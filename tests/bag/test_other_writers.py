@@ -459,3 +459,31 @@ def test_a_summary_that_repeats_the_channels_only_is_legal(tmp_path) -> None:
         writer.finish()
     with BagReader(path) as reader:
         assert_array_equal(reader.columns("/joint_states")["position"][:, 0], np.arange(10) / 10)
+
+
+def test_bytes_after_the_last_field_of_a_record_are_legal(tmp_path) -> None:
+    """So that later versions of the format can add fields."""
+    data = chunked(tmp_path / "whole.mcap", "", TEN, TEN).read_bytes()
+    padded, position = bytearray(records.MAGIC), len(records.MAGIC)
+    while position < len(data):
+        opcode, length = records.read_prefix(data, position)
+        content = data[position + records.PREFIX_BYTES :][:length]
+        spare = b"" if opcode == Opcode.CHUNK else b"\x01\xff\xff"
+        padded += bytes([opcode]) + (length + len(spare)).to_bytes(8, "little") + content + spare
+        position += records.PREFIX_BYTES + length
+    (tmp_path / "padded.mcap").write_bytes(padded)
+    with BagReader(tmp_path / "padded.mcap") as reader:
+        assert_array_equal(reader.columns("/joint_states")["position"][:, 0], np.arange(10) / 10)
+    assert recover(tmp_path / "padded.mcap", tmp_path / "new").messages == {"/joint_states": 10}
+
+
+@pytest.mark.parametrize("mode", ["FILE", "message"])
+def test_bags_that_rosbag2_compressed_are_refused_with_what_to_do(tmp_path, mode) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "bag_0.mcap.zstd").write_bytes(zstd(TEN))
+    (tmp_path / "bag" / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information: {{compression_mode: {mode}, relative_file_paths: [bag_0.mcap.zstd]}}\n"
+    )
+    for attempt in (BagReader, lambda path: recover(path, tmp_path / "new")):
+        with pytest.raises(BagError, match=r"compressed by rosbag2.*(zstd -d|ros2 bag convert)"):
+            attempt(tmp_path / "bag")
