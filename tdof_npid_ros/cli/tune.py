@@ -7,9 +7,10 @@ import json
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -30,7 +31,9 @@ from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, controller_type
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, find_parameter_file, write_parameters
 from tdof_npid_ros.parameters import TUNER
+from tdof_npid_ros.stability.margins import Margins, margins
 from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
@@ -59,10 +62,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"candidates in a step of the HGA's polish, 0: none (default: {POLISH})",
     )
+    parser.add_argument(
+        "--until-converged",
+        action="store_true",
+        help="end before the budget is spent, once two restarts of the search have ended no better",
+    )
+    parser.add_argument("--cold", action="store_true", help="do not begin with the case's own gains")
+    add_constraint_arguments(parser)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")
     add_output_arguments(parser)
+
+
+def add_constraint_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the margins that the loop must have."""
+    group = parser.add_argument_group("margins that the loop must have")
+    group.add_argument(
+        "--ms", type=float, metavar="M", help="largest M_s, the peak of the sensitivity (usual: 1.4 to 2)"
+    )
+    group.add_argument("--mt", type=float, metavar="M", help="largest M_t, the peak of T")
+    group.add_argument("--gain-margin", type=float, metavar="FACTOR", help="least factor on the gains (usual: 2 to 5)")
+    group.add_argument("--phase-margin", type=float, metavar="DEGREES", help="least (usual: 30 to 60)")
+    group.add_argument("--delay-margin", type=float, metavar="S", help="least additional dead time")
+
+
+def constraints_of(arguments: argparse.Namespace) -> Constraints:
+    """What `add_constraint_arguments` were given."""
+    return Constraints(**{field.name: getattr(arguments, field.name) for field in fields(Constraints)})
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
     _check_outputs(arguments)
     problem = _problem(arguments)
     _check_episodes(problem)
+    for reason in problem.restless.values():
+        warnings.warn(f"{reason}, so no loop comes to rest in it and none is asked to", stacklevel=2)
     study = Study(problem, arguments.checkpoint, arguments.resume)
     started = time.monotonic()
     with _interrupt_requested() as interrupted, _progress(study, shown=not arguments.json) as show:
@@ -77,15 +106,32 @@ def run(arguments: argparse.Namespace) -> int:
     if not study.done:
         _say_interrupted(study, arguments)
         return INTERRUPTED
+    study.require_feasible()
     result = study.result
+    found = margins(problem.case, result.gains)
     report = response_report(problem.case, result.gains)
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
+    report |= _search_report(study) | {"margins": found.as_dict()}
     report |= advised(problem.case, result.gains)
     if arguments.out:
         write_parameters(arguments.out, {"controller": result.gains.as_dict()})
     write_responses(problem.case, _compared(problem, result.gains), arguments)
-    print(json.dumps(report) if arguments.json else _summary(report))
+    print(json.dumps(report) if arguments.json else _summary(report, found))
     return 0
+
+
+def _search_report(study: Study) -> dict[str, Any]:
+    """What the search began with, how it ended, and what it was held to."""
+    problem, result = study.problem, study.result
+    before = response_report(problem.case, problem.case.gains)
+    return {
+        "start": "case" if problem.warm else "cold",
+        "before": {name: before[name] for name in ("controller", "gains", "objective")},
+        "at_bounds": problem.at_bounds(result.gains),
+        "constraints": problem.constraints.given,
+        "converged": result.converged,
+        "evaluations_saved": study.budget - result.evaluations,
+    }
 
 
 def _problem(arguments: argparse.Namespace) -> TuningProblem:
@@ -109,6 +155,9 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         arguments.population,
         generations,
         arguments.polish,
+        constraints_of(arguments),
+        warm=not arguments.cold,
+        until_converged=arguments.until_converged,
     )
 
 
@@ -150,7 +199,7 @@ def _progress(study: Study, shown: bool) -> Iterator[Callable[[Study], None]]:
     with tqdm(total=study.budget, initial=study.evaluations, unit=" evaluations", disable=not shown) as bar:
 
         def show(study: Study) -> None:
-            bar.set_description(f"generation {study.generation}, best {study.best_value:.6g}", refresh=False)
+            bar.set_description(f"generation {study.generation}, {study.best_told}", refresh=False)
             bar.update(study.evaluations - bar.n)
 
         yield show
@@ -160,21 +209,31 @@ def _say_interrupted(study: Study, arguments: argparse.Namespace) -> None:
     how = "go on with --resume" if arguments.checkpoint else "nothing kept, for there is no --checkpoint"
     print(
         f"tdof-npid tune: interrupted after {study.evaluations} of {study.budget} evaluations, "
-        f"best {study.best_value:.6g}: {how}",
+        f"{study.best_told}: {how}",
         file=sys.stderr,
     )
 
 
-def _summary(report: dict[str, Any]) -> str:
-    gains = [f"  {name:10} {value:.6g}" for name, value in report["gains"].items()]
-    setpoint, disturbance = report["setpoint"], report["disturbance"]
+def _summary(report: dict[str, Any], found: Margins) -> str:
+    setpoint, disturbance, before = report["setpoint"], report["disturbance"], report["before"]
+    ends = report["at_bounds"]
+    gains = [
+        f"  {name:10} {value:<12.6g} before: {before['gains'][name]:.6g}"
+        + (f"   at the {ends[name]} bound of the search" if name in ends else "")
+        for name, value in report["gains"].items()
+    ]
+    was = f"before: {before['objective']:.6g} with {before['controller']}"
+    ended = ", converged" if report["converged"] else ""
+    saved = f", {report['evaluations_saved']} saved" if report["evaluations_saved"] else ""
+    began = "the case's gains and random ones" if report["start"] == "case" else "random gains"
     return "\n".join(
         [
-            f"{report['case']}  {report['controller']}: objective {report['objective']:.6g}",
+            f"{report['case']}  {report['controller']}: objective {report['objective']:.6g}, {was}",
             *gains,
             f"  setpoint: overshoot {setpoint['overshoot_percent']:.2f} %, IAE {setpoint['iae']:.4f}",
             f"  disturbance: peak {disturbance['peak']:.4f}, IAE {disturbance['iae']:.4f}",
-            f"  {report['evaluations']} evaluations in {report['elapsed_s']:.1f} s",
+            *(f"  {line}" for line in found.lines()),
+            f"  {report['evaluations']} evaluations in {report['elapsed_s']:.1f} s, from {began}{ended}{saved}",
         ]
     )
 

@@ -11,14 +11,16 @@ bounds by the fraction 1 - r^((1 - t/T)^shape): anywhere at first, hardly at all
 That finds the valley of a good controller in a generation or two and then creeps along it. So by default the HGA
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
 and asks for the model's minimum and for samples about it, shaped like the cloud of kept points. When that has
-stalled, it restarts from a new random population, dense at the bounds, and polishes more patiently, until the budget
-is spent. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
+stalled, the round is over, and another begins from a new random population, dense at the bounds, and polishes more
+patiently, until the budget is spent. A round whose points agree already, but in a valley that lies higher than the best
+is given up. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
 
 What is not allowed never wins, but it is not thrown away: the best gains lie where a constraint just holds, and the
 model must see both sides of that. So points are kept and fitted by their *merit*, f + penalty · violation · |f|. Where
-a round ends at a point that is not allowed, the next one has a larger penalty.
+a round ends at a point that is not allowed, the next one has a larger penalty. Until something allowed has been found,
+the violation alone is the merit.
 
-A run has *converged* when two further rounds have ended no better than the best one.
+A run has *converged* when enough rounds are over and more than one of them has ended as low as the best.
 
 A run is the same on every machine: NumPy's PCG64 drawn only for uniform numbers, elementwise arithmetic, decimal
 powers, no BLAS and no math library.
@@ -57,14 +59,20 @@ PENALTY_CAP = 3.0
 PROGRESS, PATIENCE = 1e-4, 3.0
 """A polish has stalled when PATIENCE times the kept points were told without improving by PROGRESS, relatively."""
 
+HIGHER = 4.0
+"""A round is given up when its best point lies higher than the run's by so many times median - best of its points."""
+
 PENALTY, STIFFER = 3.0, 4.0
 """Of the merit: at first, and by which factor it grows."""
 
-CONFIRMING_ROUNDS = 2
-"""Rounds that must end no better than the best one before the run counts as converged..."""
+TIE = 1e-3
+"""How much the objective counts beside a violation, while nothing allowed has been found: less than this."""
+
+ROUNDS_TO_CONVERGE, CONFIRMATIONS = 5, 2
+"""Rounds that must be over, and those of them that must have ended as low as the best..."""
 
 CONFIRMED = 1e-3
-"""... by more than this, relatively."""
+"""... within this, relatively, before the run counts as converged."""
 
 
 @dataclass
@@ -74,27 +82,27 @@ class HGAState(SearchState):
     Attributes:
         round: restarts so far.
         age: generations told in this round.
-        points, merits, violations: [m, d] in 0 .. 1, [m], [m]: the best points of this round, best merit first.
+        searching: whether nothing allowed has been found yet.
+        points, objectives, violations: [m, d] in 0 .. 1, [m], [m]: the best points of this round, best merit first.
         goal: the merit below which this round counts as having made progress; `waited`: evaluations since.
         penalty: of the merit in this round.
-        confirmations: rounds that have ended since the last that made the best better.
-        round_best: the best value when the round began.
+        ends: the lowest allowed values of the rounds that are over, of those that have one.
     """
 
-    round: int = -1
+    round: int = 0
     age: int = 0
+    searching: bool = True
     points: Array = field(default_factory=lambda: np.empty((0, 0)))
-    merits: Array = field(default_factory=lambda: np.empty(0))
+    objectives: Array = field(default_factory=lambda: np.empty(0))
     violations: Array = field(default_factory=lambda: np.empty(0))
     goal: float = math.inf
     waited: int = 0
     penalty: float = PENALTY
-    confirmations: int = 0
-    round_best: float = math.inf
+    ends: Array = field(default_factory=lambda: np.empty(0))
 
 
-_COUNTS = ("evaluations", "generation", "round", "age", "waited", "confirmations")
-_NUMBERS = ("best_value", "best_violation", "goal", "penalty", "round_best")
+_COUNTS = ("evaluations", "generation", "round", "age", "waited")
+_NUMBERS = ("best_value", "best_violation", "goal", "penalty")
 
 
 class HGA(Optimizer):
@@ -142,34 +150,36 @@ class HGA(Optimizer):
         self.seed, self.population, self.generations, self.polish = seed, population, generations, polish
         self.eta, self.mutation_rate, self.shape = eta, mutation_rate, shape
         self._random = np.random.Generator(np.random.PCG64(seed))
-        self._state = HGAState(np.empty((0, self.dimension)))
-        self._state.candidates = self._with_starts(self._new_round())
+        self._state = HGAState(self._with_starts(self._random.random((population, self.dimension))))
+        self._forget()
 
     @property
     def converged(self) -> bool:
-        """Whether an allowed point has been found and `CONFIRMING_ROUNDS` further rounds have found none better."""
-        return self.best_violation == 0.0 and self._state.confirmations >= CONFIRMING_ROUNDS
+        """Whether `ROUNDS_TO_CONVERGE` rounds are over and `CONFIRMATIONS` of them ended as low as the best."""
+        ends = self._state.ends
+        as_low = int(np.count_nonzero(ends <= self.best_value + CONFIRMED * abs(self.best_value)))
+        return self.best_violation == 0.0 and len(ends) >= ROUNDS_TO_CONVERGE and as_low >= CONFIRMATIONS
 
     def _new_round(self) -> Array:
-        """Forget all but the global best and draw a random population, after the first round densely at the bounds.
+        """End the round, forget all but the global best, and draw the next one's population, densely at the bounds.
 
         A valley that lies along a bound is often narrow, and a uniform population misses it.
         """
         state = self._state
-        if state.round >= 0:
-            first = state.round_best == math.inf
-            better = first or state.best_value < state.round_best - CONFIRMED * abs(state.round_best)
-            state.confirmations = 0 if better else state.confirmations + 1
-            if state.violations[0] > 0.0:
-                state.penalty *= STIFFER
-        state.round_best = state.best_value if state.best_violation == 0.0 else math.inf
+        if state.violations[0] > 0.0:
+            state.penalty *= STIFFER
+        state.ends = np.append(state.ends, state.objectives[state.violations == 0.0].min(initial=math.inf))
         state.round += 1
+        self._forget()
+        uniform: Array = self._random.random((self.population, self.dimension))
+        return uniform * uniform * (3.0 - 2.0 * uniform)
+
+    def _forget(self) -> None:
+        state = self._state
         state.age = state.waited = 0
         state.points = np.empty((0, self.dimension))
-        state.merits, state.violations = np.empty(0), np.empty(0)
+        state.objectives, state.violations = np.empty(0), np.empty(0)
         state.goal = math.inf
-        uniform = self._random.random((self.population, self.dimension))
-        return uniform if state.round == 0 else uniform * uniform * (3.0 - 2.0 * uniform)
 
     @property
     def _kept(self) -> int:
@@ -185,18 +195,27 @@ class HGA(Optimizer):
         return max(MIN_EXPLORATION, -(-self._kept // self.population))
 
     def _next(self, told: Scores) -> Array:
-        self._state.age += 1
-        merits = told.objective + self._state.penalty * told.violation * np.abs(told.objective)
+        state = self._state
+        state.age += 1
+        if state.searching and state.best_violation == 0.0:
+            state.searching, state.goal, state.waited = False, math.inf, 0
         if self.polish:
-            self._keep_best(merits, told.violation)
-        if self._state.age < self._exploration:
-            return self._mutated(self._reproduced(merits, told.violation))
-        if self._stalled(merits.size):
+            self._keep_best(told)
+        if state.age < self._exploration:
+            return self._mutated(self._reproduced(told))
+        if self._stalled(told.objective.size):
             return self._new_round()
         return self._polished()
 
-    def _reproduced(self, merits: Array, violation: Array) -> Array:
-        allowed = merits[violation == 0.0]
+    def _merits(self, objective: Array, violation: Array) -> Array:
+        """What points are kept and fitted by, [m]."""
+        if self._state.searching:
+            return violation + TIE * objective / (1.0 + np.abs(objective))
+        return objective + self._state.penalty * violation * np.abs(objective)
+
+    def _reproduced(self, told: Scores) -> Array:
+        merits = self._merits(told.objective, told.violation)
+        allowed = merits[told.violation == 0.0]
         values = np.minimum(merits, max(allowed.max(), merits.min())) if allowed.size else merits
         best, worst = values.min(), values.max()
         weight = (values - best) / (worst - best) if worst > best else np.zeros_like(values)
@@ -215,23 +234,33 @@ class HGA(Optimizer):
             x[i, j] += reach * (bound[i, j] - x[i, j])
         return x
 
-    def _keep_best(self, merits: Array, violation: Array) -> None:
+    def _keep_best(self, told: Scores) -> None:
         state = self._state
-        merits, violation = np.append(state.merits, merits), np.append(state.violations, violation)
-        best = np.argsort(merits, kind="stable")[: self._kept]
+        objectives = np.append(state.objectives, told.objective)
+        violations = np.append(state.violations, told.violation)
+        best = np.argsort(self._merits(objectives, violations), kind="stable")[: self._kept]
         state.points = np.concatenate([state.points, state.candidates])[best]
-        state.merits, state.violations = merits[best], violation[best]
+        state.objectives, state.violations = objectives[best], violations[best]
 
     def _stalled(self, told: int) -> bool:
-        state, best = self._state, float(self._state.merits[0])
+        state = self._state
+        best = float(self._merits(state.objectives[:1], state.violations[:1])[0])
         if best < state.goal:
             state.goal, state.waited = best - PROGRESS * abs(best), 0
         else:
             state.waited += told
-        return state.waited > PATIENCE * self._kept
+        return state.waited > PATIENCE * self._kept or self._is_higher()
+
+    def _is_higher(self) -> bool:
+        """Whether the round's points are in a valley that lies higher than the best of the run."""
+        state = self._state
+        if state.searching or len(state.points) < self._kept:
+            return False
+        merits = self._merits(state.objectives, state.violations)
+        return bool(merits[0] - HIGHER * (merits[merits.size // 2] - merits[0]) > state.best_value)
 
     def _polished(self) -> Array:
-        points, merits = self._state.points, self._state.merits
+        points, merits = self._state.points, self._merits(self._state.objectives, self._state.violations)
         best, median = merits[0], merits[merits.size // 2]
         centre, cloud = model_step(points, np.minimum(merits, best + PENALTY_CAP * (median - best)), TRUST_RADIUS)
         # Uniform with variance 1: a normal draw's rare tails would go through the C library.
@@ -278,7 +307,7 @@ _ARGUMENTS = ("seed", "population", "generations", "eta", "mutation_rate", "shap
 def _encoded(value: Any) -> Any:
     """A part of the state as JSON holds it: infinity, which JSON does not know, is None."""
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return [_encoded(one) for one in value.tolist()] if value.ndim == 1 else value.tolist()
     return None if value == math.inf else value
 
 
@@ -287,17 +316,19 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
     _check(**{name: state[name] for name in _COUNTS})
     numbers = {name: math.inf if state[name] is None else float(_finite([state[name]])[0]) for name in _NUMBERS}
     best = None if state["best"] is None else _unit([state["best"]], dimension)[0]
-    points, merits = _unit(state["points"], dimension), _finite(state["merits"])
-    violations = _finite(state["violations"])
-    if not len(points) == len(merits) == len(violations) or (merits[1:] < merits[:-1]).any():
-        raise ValueError("points, merits and violations")
+    points = _unit(state["points"], dimension)
+    objectives, violations = _finite(state["objectives"]), _finite(state["violations"])
+    if not len(points) == len(objectives) == len(violations) or not isinstance(state["searching"], bool):
+        raise ValueError("points, objectives and violations")
     if (best is None) != (state["generation"] == 0) or (best is None) != (numbers["best_value"] == math.inf):
         raise ValueError("best")
     return HGAState(
         candidates=_unit(state["candidates"], dimension),
         best=best,
         points=points,
-        merits=merits,
+        searching=state["searching"],
+        ends=np.append(np.empty(0), [math.inf if one is None else float(_finite([one])[0]) for one in state["ends"]]),
+        objectives=objectives,
         violations=violations,
         **{name: state[name] for name in _COUNTS},
         **numbers,  # type: ignore[arg-type]

@@ -69,17 +69,31 @@ class Constraints:
         """By how much a stable lane misses them, relatively and added up, (lanes,); 0 where it has them all."""
         excess = np.zeros(margins.m_s.shape)
         for name, limit in self.given.items():
-            if name in ("ms", "mt"):  # with a loop gain that falls, a peak falls towards 1
-                value = margins.m_s if name == "ms" else margins.m_t
-                missed = (value - limit) / (limit - 1.0)
-            elif name == "gain_margin":
-                missed = limit / np.minimum(margins.gain_margin, 1.0 / np.maximum(margins.gain_margin_low, 1e-300)) - 1
-            elif name == "phase_margin":
-                missed = 1.0 - np.degrees(margins.phase_margin) / limit
-            else:
-                missed = 1.0 - margins.delay_margin / limit
+            value = _margin(margins, name)
+            # With less and less gain a peak falls towards 1.
+            missed = (value - limit) / (limit - 1.0) if name in ("ms", "mt") else 1.0 - value / limit
             excess += np.clip(np.nan_to_num(missed, nan=WORST_EXCESS), 0.0, WORST_EXCESS)
         return excess
+
+    def missed(self, margins: LaneMargins) -> list[str]:
+        """What the first lane misses, in words."""
+        told = []
+        for name, limit in self.given.items():
+            value = float(_margin(margins, name)[0])
+            if not (value <= limit if name in ("ms", "mt") else value >= limit):
+                most = "at most" if name in ("ms", "mt") else "at least"
+                told.append(f"{name.replace('_', ' ')} {most} {limit:g} (nearest: {value:.4g})")
+        return told
+
+
+def _margin(margins: LaneMargins, name: str) -> Array:
+    """The margin that a constraint is about, in its unit, (lanes,)."""
+    if name == "gain_margin":
+        with np.errstate(divide="ignore"):
+            least: Array = np.minimum(margins.gain_margin, 1.0 / margins.gain_margin_low)
+        return least
+    values = {"ms": margins.m_s, "mt": margins.m_t, "delay_margin": margins.delay_margin}
+    return np.degrees(margins.phase_margin) if name == "phase_margin" else values[name]
 
 
 class Judge:
@@ -88,7 +102,7 @@ class Judge:
     Args:
         screen: of the linearised loop; None if there is none: then by the outputs alone.
         constraints: none but without a screen.
-        lengths: of the setpoint and the disturbance episode, in s.
+        lengths: of the setpoint and the disturbance episode, in s; 0 for one in which no loop can come to rest.
         weight: w of the objective.
         noise_bound: how far a measured output is from the plant's at the most, in its unit.
     """
@@ -137,8 +151,10 @@ class Judge:
 
 
 def tail(episode: Integrals, length: float, gains: Gains, margins: LaneMargins | None) -> Array:
-    """A bound of the IAE that would come after an episode of `length` s, (lanes,)."""
+    """A bound of the IAE that would come after an episode of `length` s, (lanes,); 0 for a length of 0."""
     error, late, early = episode.rest_error, episode.late_rest_iae, episode.early_rest_iae
+    if length == 0.0:
+        return np.zeros_like(error)
     for_ever = FOR_EVER * length
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         if margins is None:

@@ -14,11 +14,11 @@ from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameters import TUNER, WEIGHT
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.stability import StabilityError
-from tdof_npid_ros.stability.plant import loop_plant
+from tdof_npid_ros.stability.plant import loop_plant, operating_point
 from tdof_npid_ros.stability.screen import Screen
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
-from tdof_npid_ros.tuning.judge import Constraints, Judge
+from tdof_npid_ros.tuning.judge import DIVERGED, LARGEST_TAIL, UNSTABLE, Constraints, Judge
 from tdof_npid_ros.tuning.space import Space
 
 EPISODES = ("setpoint", "disturbance")
@@ -144,8 +144,7 @@ class TuningProblem:
         """The candidates that the search begins with beside random ones, (k, len(names))."""
         if not self.warm:
             return np.empty((0, len(self.names)))
-        gains = [float(self.case.gains.per_lane(name)[0]) for name in self.names]
-        start: Array = np.clip([gains], *np.array(self.bounds).T)
+        start: Array = np.clip(candidate_of(self, self.case.gains), *np.array(self.bounds).T)
         return start
 
     @property
@@ -174,8 +173,45 @@ class TuningProblem:
     @cached_property
     def judge(self) -> Judge:
         """Of which candidates may win."""
-        setpoint, disturbance = (self.case.signals[episode].steps * self.case.sample_period for episode in EPISODES)
+        setpoint, disturbance = (
+            0.0 if episode in self.restless else self.case.signals[episode].steps * self.case.sample_period
+            for episode in EPISODES
+        )
         return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight, self.case.noise_bound)
+
+    @cached_property
+    def restless(self) -> dict[str, str]:
+        """The episodes in which no loop comes to rest, because that takes an effort beyond the limits: the reason."""
+        case, reasons = self.case, {}
+        low, high = (float(case.gains.per_lane(name)[0]) for name in ("effort_min", "effort_max"))
+        low, high = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
+        for episode in EPISODES:
+            r, d = float(case.signals[episode].setpoint[-1]), float(case.signals[episode].disturbance[-1])
+            try:
+                effort = operating_point(case, self.base.with_values(kp=1.0, ki=1.0, kd=0.0), r, d).effort
+            except StabilityError:
+                continue
+            if effort is not None and not low <= effort <= high:
+                reasons[episode] = (
+                    f"episode {episode}: to rest at {r:g} under the disturbance {d:g} takes an effort of {effort:.4g}, "
+                    f"beyond the limits {low:g} .. {high:g}"
+                )
+        return reasons
+
+    def shortfall(self, gains: Gains, violation: float) -> str:
+        """Why nothing was allowed, from the gains that came nearest and their violation."""
+        within = f"{self.case.name}: within the bounds of the search"
+        if violation >= DIVERGED:
+            return f"{within} every {self.controller} that was tried diverges"
+        if violation >= UNSTABLE:
+            return f"{within} no {self.controller} was found whose loop is stable"
+        missed = self.constraints.missed(self.screen(gains)) if self.screen else []
+        if missed:
+            return f"{within} no {self.controller} was found with {'; '.join(missed)}; allow more, or widen the bounds"
+        return (
+            f"{within} no {self.controller} was found whose error has come to rest by the end of the episodes "
+            f"(what may follow must be below {LARGEST_TAIL:.1%} of the objective); give them more time, or ki a range"
+        )
 
     def at_bounds(self, gains: Gains) -> dict[str, str]:
         """The free gains that lie at a bound of the search: `lower` or `upper` by name."""
@@ -214,3 +250,8 @@ class TuningProblem:
             "starts": self.starts.tolist(),
             "until_converged": self.until_converged,
         }
+
+
+def candidate_of(problem: TuningProblem, gains: Gains) -> Array:
+    """Gains as the one candidate (1, len(problem.names)) of a generation."""
+    return np.array([[float(gains.per_lane(name)[0]) for name in problem.names]])

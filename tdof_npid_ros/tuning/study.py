@@ -121,6 +121,17 @@ class Study:
         return self._optimizer.best_violation == 0.0
 
     @property
+    def best_told(self) -> str:
+        """The best so far in a few words."""
+        return f"best {self.best_value:.6g}" if self.feasible else "nothing allowed yet"
+
+    def require_feasible(self) -> None:
+        """Raise TuningError, with the reason, if nothing that was seen is allowed."""
+        if not self.feasible:
+            violation = self._optimizer.best_violation
+            raise TuningError(f"{self.problem.shortfall(self.result.gains, violation)}: no gains are given")
+
+    @property
     def result(self) -> TuningResult:
         """The best so far. Raises TuningError before the first generation."""
         gains = self.problem.gains(self._optimizer.best_x)

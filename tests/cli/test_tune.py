@@ -49,12 +49,65 @@ def test_it_prints_what_simulate_prints_for_the_optimum(tmp_path: Path, capsys: 
     simulated = json.loads(capsys.readouterr().out)
     assert report.pop("evaluations") == 50
     assert report.pop("elapsed_s") > 0
-    assert report == simulated
+    assert {name: report[name] for name in simulated} == simulated
+    assert report["margins"]["stable"]
 
 
 def test_the_objective_printed_is_the_one_that_the_search_minimised(capsys: pytest.CaptureFixture[str]) -> None:
     result = tune_case(load_case("p3-c1"), "tdof_npid1", seed=2, population=10, generations=5)
-    assert tuned(capsys, "--controller", "tdof_npid1")["objective"] == result.objective
+    assert tuned(capsys, "--controller", "tdof_npid1", "--cold")["objective"] == result.objective
+
+
+def test_the_case_s_gains_are_where_it_starts_unless_it_starts_cold(capsys: pytest.CaptureFixture[str]) -> None:
+    case = load_case("p3-c1")
+    before = case.setpoint_response().iae + case.disturbance_response().iae
+    warm = tuned(capsys, "--controller", "tdof_npid2")
+    assert warm["start"] == "case"
+    assert warm["before"]["objective"] == before
+    assert warm["before"]["gains"]["kp"] == case.gains.kp
+    assert warm["objective"] <= before
+    assert json_of(capsys, "p3-c1", "--controller", "pid", "--budget", "400", "--cold")["start"] == "cold"
+
+
+def test_gains_that_end_at_a_bound_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = tmp_path / "narrow.yaml"
+    case.write_text((config_folder() / "p3-c1.yaml").read_text().replace("kp: [0.01, ", "kp: [0.01, 0.9]  # ["))
+    assert main(["tune", str(case), "--controller", "pid", "--budget", "800", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["at_bounds"] == {"kp": "upper"}
+    assert main(["tune", str(case), "--controller", "pid", "--budget", "800"]) == 0
+    assert "at the upper bound" in capsys.readouterr().out
+
+
+def test_the_margins_asked_for_are_kept_and_cost_objective(capsys: pytest.CaptureFixture[str]) -> None:
+    length = ["--budget", "1200", "--controller", "pid"]
+    free, held = (json_of(capsys, "p3-c1", *length, *more) for more in ([], ["--ms", "1.6", "--phase-margin", "50"]))
+    assert free["margins"]["m_s"] > 2.0
+    assert held["constraints"] == {"ms": 1.6, "phase_margin": 50.0}
+    assert 1.4 < held["margins"]["m_s"] <= 1.601
+    assert held["margins"]["phase_margin_deg"] >= 49.9
+    assert held["objective"] > free["objective"]
+
+
+def test_margins_that_nothing_within_the_bounds_has_are_said_and_no_gains_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.yaml"
+    told = refused(capsys, *QUICK, "--controller", "pid", "--ms", "1.001", "--out", str(out), "--json")
+    assert "no pid was found with ms at most 1.001 (nearest: " in told
+    assert not out.exists()
+
+
+def test_it_ends_by_itself_when_it_has_converged(capsys: pytest.CaptureFixture[str]) -> None:
+    report = json_of(capsys, "p3-c1", "--controller", "pid", "--until-converged")
+    assert report["converged"]
+    assert report["evaluations_saved"] == 8000 - report["evaluations"] > 2000
+    assert report["objective"] <= 1.001 * 5.262344
+
+
+def json_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main(["tune", *arguments, "--json"]) == 0
+    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return report
 
 
 def test_the_weight_counts_in_the_objective(capsys: pytest.CaptureFixture[str]) -> None:

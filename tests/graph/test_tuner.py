@@ -20,12 +20,16 @@ from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType
 from tdof_npid_ros.parameter_file import read_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
+from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
 CASES = {"/p1": "p1-c0.5", "/p1_too": "p1-c0.5", "/p3": "p3-c1"}
-SHORT = {"setpoint": ("0 setpoint 1", "0.8 end"), "disturbance": ("0 disturbance 1", "0.7 end")}
+SHORT = {  # the signals move up to the end, so nobody asks whether the loop has come to rest
+    "setpoint": ("0 setpoint 1", "0.78 setpoint 1.1", "0.8 end"),
+    "disturbance": ("0 disturbance 1", "0.68 disturbance 1.1", "0.7 end"),
+}
 QUICK: dict[str, Any] = {"population": 5, "generations": 4, "polish": 5}
 Visited = list[tuple[list[list[float]], list[float], list[float]]]
 
@@ -36,6 +40,11 @@ def short(case: str) -> Case:
 
 def problem(case: str = "p1-c0.5", kind: ControllerType = "tdof_npid2", seed: int = 0, **options: Any) -> TuningProblem:
     return TuningProblem(short(case), kind, seed=seed, **{**QUICK, **options})
+
+
+def as_the_node_has_it(*arguments: Any, **options: Any) -> TuningProblem:
+    """The problem of a tuner node, which begins with the case's gains and ends when it has converged."""
+    return problem(*arguments, warm=True, until_converged=True, **options)
 
 
 def visited(study: Study, evaluate: Callable[[Array], Scores], after: Callable[[Study], bool] | None = None) -> Visited:
@@ -155,6 +164,15 @@ def test_tuned_live_equals_tuned_offline(
     assert visited(Study(which), tuner.pool(which, [namespace]).evaluate) == offline(which)
 
 
+def test_tuned_live_equals_tuned_offline_under_constraints_from_the_case_s_gains(loops: Any, tuner: LiveTuner) -> None:
+    which = problem(kind="npid", seed=9, constraints=Constraints(ms=1.6, phase_margin=40.0), warm=True)
+    live = visited(Study(which), tuner.pool(which, ["/p1"]).evaluate)
+    assert live == offline(which)
+    violations = np.concatenate([violation for _, _, violation in live])
+    assert (violations == 0.0).any()
+    assert ((violations > 0.0) & (violations < 100.0)).any()
+
+
 def test_two_loops_give_what_one_gives(loops: Any, tuner: LiveTuner) -> None:
     which = problem(seed=3)
     pool = tuner.pool(which, ["/p1", "/p1_too"])
@@ -228,7 +246,7 @@ def test_a_run_killed_and_started_again_ends_as_one_left_alone(
     again = loops.start("tuner", "-p", f"case:={case}", **parameters)
     again.stopped = True  # it ends by itself
     loops.wait_until(lambda: again.process.poll() is not None, 60, "the end of the second run")
-    which = problem(kind="npid", seed=6, generations=12)
+    which = as_the_node_has_it(kind="npid", seed=6, generations=12)
     study = Study(which)
     study.run(Objective(which))
     assert read_parameters(tmp_path / "tuned.yaml", "controller") == study.result.gains.as_dict()
@@ -332,7 +350,7 @@ def test_a_disk_that_fills_up_meanwhile_leaves_the_gains_on_the_controller(
     process.expected_status = 2
     loops.wait_until(lambda: process.process.poll() is not None, 60, "the end of the tuner")
     assert "/dev/full cannot be written: No space left on device" in process.log
-    which = problem(kind="pid", seed=8)
+    which = as_the_node_has_it(kind="pid", seed=8)
     study = Study(which)
     study.run(Objective(which))
     assert loops.get_parameters("/p1/controller", "type", "kp") == ["pid", study.result.gains.kp]
@@ -355,7 +373,7 @@ def test_it_ends_with_the_generation_and_leaves_the_best_so_far(
     assert process.stop() < 5.0
     assert "interrupted after" in process.log
     evaluations = int(process.log.split("interrupted after ")[1].split()[0])
-    study = Study(problem("p3-c1", "pid", seed=0, generations=500))
+    study = Study(as_the_node_has_it("p3-c1", "pid", seed=0, generations=500))
     study.run(Objective(study.problem), lambda study: study.evaluations < evaluations)
     best = study.result.gains
     assert loops.get_parameters("/p3/controller", "type", "kp", "ki", "kd") == ["pid", best.kp, best.ki, best.kd]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.ask_tell import Scores
 from tdof_npid_ros.tuning.hga import HGA
 
 Array = NDArray[np.float64]
@@ -45,9 +47,9 @@ def run(hga: HGA, objective: Objective, tells: int | None = None) -> list[Array]
     return asked
 
 
-def cube(dimension: int, **options: int | float) -> HGA:
+def cube(dimension: int, **options: Any) -> HGA:
     options = {"seed": 1, **options}
-    return HGA([-3.0] * dimension, [5.0] * dimension, **options)  # type: ignore[arg-type]
+    return HGA([-3.0] * dimension, [5.0] * dimension, **options)
 
 
 @pytest.mark.parametrize("polish", [0, 1, 6, 40])
@@ -213,13 +215,59 @@ def test_options_out_of_range_are_refused(option: dict[str, float]) -> None:
         cube(2, **option)
 
 
+def half_forbidden(x: Array) -> Scores:
+    """A bowl whose lowest point is not allowed: the best that is lies where the first parameter is 1."""
+    return Scores(1.0 + sphere(x + 0.5), np.maximum(1.0 - x[:, 0], 0.0))
+
+
+def test_what_is_not_allowed_never_wins_and_the_best_is_found_where_the_constraint_holds() -> None:
+    for seed in range(3):
+        hga = cube(3, seed=seed)
+        told: list[tuple[float, float]] = []
+        while not hga.done:
+            scores = half_forbidden(hga.ask())
+            told += zip(scores.violation.tolist(), scores.objective.tolist(), strict=True)
+            hga.tell(scores)
+            assert (hga.best_violation, hga.best_value) == min(told)
+        assert hga.best_violation == 0.0
+        assert hga.best_value <= 1.0005 * (1.0 + 1.5**2)
+
+
+def test_of_points_that_are_all_forbidden_the_nearest_to_what_is_allowed_is_the_best() -> None:
+    hga = cube(2)
+    while not hga.done:
+        hga.tell(Scores(1.0 + sphere(hga.ask()), 1.0 + np.abs(hga.ask() - 2.0).max(axis=1)))
+    assert hga.best_violation == pytest.approx(1.0, abs=0.01)
+    assert not hga.converged
+
+
+def test_the_starts_are_among_the_first_candidates() -> None:
+    starts = [[1.0, 2.0, -1.0], [0.0, 0.0, 0.0]]
+    hga, without = cube(3, starts=starts), cube(3)
+    np.testing.assert_allclose(hga.ask()[:2], starts, atol=1e-12)
+    assert np.array_equal(hga.ask()[2:], without.ask()[2:])
+
+
+def test_a_run_that_has_converged_says_so_and_finds_hardly_better_in_the_rest_of_its_budget() -> None:
+    for seed in range(3):
+        hga = HGA([0.0, 0.0, 0.0], [30.0, 3.0, 9.0], seed=seed)
+        assert not hga.converged
+        while not hga.converged:
+            hga.tell(kinked_valley(hga.ask()))
+        assert hga.evaluations < 0.8 * hga.budget
+        found = hga.best_value
+        run(hga, kinked_valley)
+        assert hga.best_value >= found / 1.001
+
+
 DAMAGE = {
     "lower": [5.0, 5.0],
     "evaluations": -1,
     "generation": "two",
     "candidates": [[0.5, 1.5]],
     "points": [[0.5]],
-    "merits": [1.0, float("nan")],
+    "objectives": [1.0, float("nan")],
+    "searching": 3,
     "violations": [0.0],
     "penalty": "much",
     "best": [0.5],

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
@@ -178,8 +177,3 @@ class LoopPool:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self._heard[status.name] = time.monotonic()
-
-
-def candidate_of(problem: TuningProblem, gains: Gains) -> Array:
-    """Gains as the one candidate (1, gains) of a generation."""
-    return np.array([[getattr(gains, name) for name in problem.names]])

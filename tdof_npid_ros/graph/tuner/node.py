@@ -6,7 +6,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,14 +20,15 @@ from tdof_npid_ros.graph.runtime.node import ERROR, OK, LoopNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.graph.runtime.run import Stop, run_node
 from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
-from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool, candidate_of
+from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool
 from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
 from tdof_npid_ros.parameters import BOUNDS, TUNER
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
-from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.judge import Constraints
+from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
 from tdof_npid_ros.tuning.study import Study
 
 POLL = 0.05  # s between two looks for a signal
@@ -143,6 +144,9 @@ class TunerNode(LoopNode):
             given["population"],
             given["generations"],
             given["polish"],
+            Constraints(**{one.name: given[one.name] or None for one in fields(Constraints)}),
+            warm=given["start"] == "case",
+            until_converged=given["until_converged"],
         )
 
     def _step_test(self) -> StepTest | None:
@@ -152,6 +156,9 @@ class TunerNode(LoopNode):
             return None
         if len(self.loops) != 1 or EVERY_LOOP in self.loops:
             raise ParameterError(f"loops are {self.loops}: episode alternate tunes one loop, name that one")
+        if self.problem.constraints.given:
+            asked = ", ".join(self.problem.constraints.given)
+            raise ParameterError(f"{asked} with episode alternate: margins are those of a model, and this has none")
         levels, safe_output, safe_effort = (
             (given[name][0], given[name][1]) for name in ("levels", "safe_range.output", "safe_range.effort")
         )
@@ -169,6 +176,8 @@ class TunerNode(LoopNode):
         """
         while not self.activated.wait(POLL):
             self.check_interrupted()
+        for reason in self.problem.restless.values() if self.step_test is None else ():
+            self.get_logger().warning(f"{reason}, so no loop comes to rest in it and none is asked to")
         self.report("tuning", "tuning")
         try:
             with tqdm(
@@ -178,14 +187,15 @@ class TunerNode(LoopNode):
                 disable=not sys.stderr.isatty(),
             ) as self.bar:
                 self.study.run(self.evaluator.evaluate, self._after_generation)
-            if self.study.done and self.step_test is None:
+            if self.study.done and self.study.feasible and self.step_test is None:
                 self._confirm()
         finally:
             self.stop_requested = self.stop_at_once = False
-            self.evaluator.restore(self.study.result.gains if self.study.generation else None)
+            self.evaluator.restore(self.study.result.gains if self.study.feasible else None)
         if self.study.done:
+            self.study.require_feasible()
             self._write_result()
-            self.report("finished", f"finished: best {self.study.best_value:.6g}")
+            self.report("finished", self._finished())
         else:
             self.report("interrupted", self._interrupted())
 
@@ -202,7 +212,7 @@ class TunerNode(LoopNode):
 
     def _after_generation(self, study: Study) -> bool:
         self._publish_progress()
-        text = f"generation {study.generation}: best {study.best_value:.6g}"
+        text = f"generation {study.generation}: {study.best_told}"
         self.bar.set_description(text, refresh=False)
         self.bar.update(study.evaluations - self.bar.n)
         if self.bar.disable:
@@ -236,6 +246,14 @@ class TunerNode(LoopNode):
         if self.result_file is not None:
             write_parameters(self.result_file, {"controller": self.study.result.gains.as_dict()})
             self.get_logger().info(f"gains written to {self.result_file}")
+
+    def _finished(self) -> str:
+        study, problem = self.study, self.problem
+        told = f"finished: {study.best_told}"
+        if saved := study.budget - study.evaluations:
+            told += f", converged with {saved} of {study.budget} evaluations to spare"
+        ends = problem.at_bounds(study.result.gains)
+        return told + "".join(f"; {name} is at its {end} bound" for name, end in ends.items())
 
     def _interrupted(self) -> str:
         return f"interrupted after {self.study.evaluations} of {self.study.budget} evaluations: {self.how_to_go_on}"
