@@ -11,12 +11,21 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tdof_npid_ros.cli.tune import add_constraint_arguments, constraints_of
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
 from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.pareto import GENERATIONS, RATIOS, Front, check_installed, foptd_case, pareto_front
+from tdof_npid_ros.tuning.pareto import (
+    GENERATIONS,
+    RATIOS,
+    Front,
+    check_installed,
+    foptd_case,
+    pareto_front,
+    poorer_of,
+)
 
 SUBCOMMAND = "pareto"
 
@@ -38,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write one point as a ROS parameter file (one --ratio and --controller)",
     )
+    add_constraint_arguments(parser)
     selected = parser.add_mutually_exclusive_group()
     selected.add_argument("--index", type=int, metavar="N", help="of the point to write, by increasing IAE_SP")
     selected.add_argument(
@@ -58,7 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
         foptd_case(ratio)
     if arguments.out:
         claim_folder(arguments.out, SUBCOMMAND)
-    fronts = []
+    fronts: list[Front] = []
+    constraints = constraints_of(arguments)
     searches = [(ratio, controller) for ratio in ratios for controller in controllers]
     with tqdm(total=len(searches) * arguments.generations, unit="generation", leave=False) as bar:
         for ratio, controller in searches:
@@ -69,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
                     controller,
                     seed=arguments.seed,
                     generations=arguments.generations,
+                    constraints=constraints,
+                    poorer=poorer_of(fronts, ratio, controller),
                     after_generation=bar.update,
                 )
             )

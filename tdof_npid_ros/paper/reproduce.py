@@ -31,7 +31,7 @@ from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdow
 from tdof_npid_ros.paper.report import Figure, Finding, Table
 from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, ROWS
 from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
-from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front
+from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front, poorer_of
 from tdof_npid_ros.tuning.problem import GENERATIONS
 
 TITLE = "Design of novel TDOF nonlinear PID controllers, reproduced"
@@ -193,7 +193,9 @@ class Reproduction:
         controller = CONTROLLER_TYPES[kind]
 
         def search() -> None:
-            self.fronts.append(pareto_front(ratio, controller, generations=self.effort.pareto_generations))
+            poorer = poorer_of(self.fronts, ratio, controller)
+            generations = self.effort.pareto_generations
+            self.fronts.append(pareto_front(ratio, controller, generations=generations, poorer=poorer))
 
         return f"NSGA-II: L/T = {ratio:g}, {CONTROLLER_TITLES[controller]}", search
 

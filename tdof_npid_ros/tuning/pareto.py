@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,22 @@ from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import PER_LANE, ControllerType, Gains
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
-from tdof_npid_ros.tuning.objective import Objective, objective_values
-from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.judge import Constraints
+from tdof_npid_ros.tuning.objective import Objective, objective_values, scores
+from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
+from tdof_npid_ros.tuning.space import Space
+from tdof_npid_ros.tuning.study import Study
 
 RATIOS = (0.1, 0.5, 1.0)  # L/T of Figure 6
 POPULATION = 96  # whole blocks of the compiled loop
 GENERATIONS = 200
 LARGEST_POPULATION = 2000  # NSGA-II compares each point with each other one
+
+POORER: dict[ControllerType, ControllerType] = {"tdof_npid1": "npid", "tdof_npid2": "tdof_npid1"}
+"""The type that a type contains: with alpha, or beta, of 0."""
+
+MOST_DISTURBANCE = 1e6
+"""The weight with which hardly anything but IAE_DIS counts."""
 
 PYMOO_NSGA2 = "pymoo.algorithms.moo.nsga2"
 
@@ -130,52 +139,121 @@ def pareto_front(
     seed: int = 0,
     population: int = POPULATION,
     generations: int = GENERATIONS,
+    constraints: Constraints | None = None,
+    poorer: Front | None = None,
     after_generation: Callable[[], object] = lambda: None,
 ) -> Front:
     """The front that NSGA-II finds; the same one for the same arguments.
 
+    It begins with the ends of the front, which the HGA finds, with the points of a poorer controller's front, and with
+    random points; and no point of the front is worse than those.
+
     Args:
         ratio: L/T.
         seed: not negative.
-        after_generation: called after each generation, for a progress bar.
+        constraints: margins that each point must have; see `Judge` for what else it must be.
+        poorer: the front of the type in `POORER`, which this type contains; found here if it is not given.
+        after_generation: called after each generation of NSGA-II, for a progress bar.
 
     Raises:
-        TuningError: an argument out of its range, or pymoo is not installed.
+        TuningError: an argument out of its range, no point that is allowed, or pymoo is not installed.
     """
     if seed < 0 or population < 4 or generations < 1:
         raise TuningError(f"seed {seed}, population {population}, generations {generations}: at least 0, 4 and 1")
-    if population > LARGEST_POPULATION:
-        raise TuningError(f"population is {population}: NSGA-II takes {LARGEST_POPULATION} or less")
     check_installed()
+    constraints = constraints or Constraints()
+    if poorer is None and controller in POORER:
+        poorer = pareto_front(
+            ratio,
+            POORER[controller],
+            seed=seed,
+            population=population,
+            generations=generations,
+            constraints=constraints,
+        )
+    case = foptd_case(ratio)
+    problem = TuningProblem(case, controller, constraints=constraints, seed=seed, generations=max(1, generations // 4))
+    objective, space = Objective(problem), problem.space
+    known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem), *(poorer.gains if poorer else ()))]
+    starts = np.reshape(known, (-1, len(problem.names)))
+
+    def costs(candidates: Array) -> tuple[Array, Array]:
+        setpoint, disturbance = objective.integrals(candidates)
+        pairs = ((setpoint, disturbance), (disturbance, setpoint))
+        measures = np.column_stack([objective_values(*pair, weight=0.0) for pair in pairs])
+        return measures, scores(problem, candidates, setpoint, disturbance).violation
+
+    found = space.at(_nsga2(costs, space, space.of(starts), seed, population, generations, after_generation))
+    candidates = np.unique(np.concatenate([starts, found]), axis=0)
+    iae, violation = costs(candidates)
+    candidates, iae = candidates[violation == 0.0], iae[violation == 0.0]
+    if not len(candidates):
+        raise TuningError(f"L/T = {ratio:g}: no {controller} was found that is allowed: ask for less, or search longer")
+    best = ~np.any(np.all(iae[None] <= iae[:, None], axis=2) & np.any(iae[None] < iae[:, None], axis=2), axis=1)
+    _, first = np.unique(iae[best], axis=0, return_index=True)
+    candidates, iae = candidates[best][first], iae[best][first]
+    return Front(case, controller, ratio, tuple(problem.gains(one) for one in candidates), iae)
+
+
+def poorer_of(fronts: Sequence[Front], ratio: float, controller: ControllerType) -> Front | None:
+    """Of fronts found with the same arguments, that of the type which this one contains, if it is there."""
+    kind = POORER.get(controller)
+    return next((front for front in fronts if (front.ratio, front.controller) == (ratio, kind)), None)
+
+
+def _ends(problem: TuningProblem) -> list[Gains]:
+    """The gains with the least IAE_SP, and with the least IAE_DIS, that the HGA finds."""
+    ends = []
+    for weight in (0.0, MOST_DISTURBANCE):
+        study = Study(replace(problem, weight=weight))
+        study.run(Objective(study.problem))
+        if study.feasible:
+            ends.append(study.result.gains)
+    return ends
+
+
+def _nsga2(
+    costs: Callable[[Array], tuple[Array, Array]],
+    space: Space,
+    starts: Array,
+    seed: int,
+    population: int,
+    generations: int,
+    after_generation: Callable[[], object],
+) -> Array:
+    """The points [n, d] in 0 .. 1 that NSGA-II ends with.
+
+    Args:
+        costs: both measures [n, 2] and the violations [n] of candidates [n, d].
+        starts: [k, d] in 0 .. 1; half the population at most begins there.
+    """
     nsga2, problems, optimize, callback = (
         importlib.import_module(name)
         for name in (PYMOO_NSGA2, "pymoo.core.problem", "pymoo.optimize", "pymoo.core.callback")
     )
-    case = foptd_case(ratio)
-    problem = TuningProblem(case, controller)
-    objective = Objective(problem)
+    dimension = space.lower.size
 
     class Tradeoff(problems.Problem):  # type: ignore[misc, name-defined]
         def _evaluate(self, x: Array, out: dict[str, Array], *_: Any, **__: Any) -> None:
-            setpoint, disturbance = objective.integrals(x)
-            costs = [objective_values(*pair, weight=0.0) for pair in ((setpoint, disturbance), (disturbance, setpoint))]
-            out["F"] = np.column_stack(costs)
+            out["F"], violation = costs(space.at(x))
+            out["G"] = violation[:, None]
 
     class Progress(callback.Callback):  # type: ignore[misc, name-defined]
         def notify(self, _: Any) -> None:
             after_generation()
 
-    lower, upper = (np.array(bound) for bound in zip(*problem.bounds, strict=True))
+    first = np.random.default_rng(seed).random((population, dimension))
+    if len(starts):
+        chosen = starts[np.linspace(0, len(starts) - 1, min(population // 2, len(starts))).astype(int)]
+        first[: len(chosen)] = chosen
     found = optimize.minimize(
-        Tradeoff(n_var=len(lower), n_obj=2, xl=lower, xu=upper),
-        nsga2.NSGA2(pop_size=population),
+        Tradeoff(n_var=dimension, n_obj=2, n_ieq_constr=1, xl=np.zeros(dimension), xu=np.ones(dimension)),
+        nsga2.NSGA2(pop_size=population, sampling=first),
         ("n_gen", generations),
         seed=seed,
         callback=Progress(),
     )
-    order = np.lexsort(found.F.T[::-1])
-    gains = tuple(problem.gains(candidate) for candidate in found.X[order])
-    return Front(case, controller, ratio, gains, np.asarray(found.F[order], dtype=np.float64))
+    return np.empty((0, dimension)) if found.X is None else np.reshape(found.X, (-1, dimension))
 
 
 def dominated_fraction(front: Front, other: Front) -> float:
