@@ -228,7 +228,8 @@ class Reproduction:
         if self.rows:
             yield Section("What reproduces", (at_a_glance(self.rows),))
             yield Section(
-                "The paper's conclusions on our numbers", (against_pid(self.rows), against_published(self.rows))
+                "The paper's conclusions on our numbers",
+                (against_pid(self.rows), against_published(self.rows)),
             )
             yield Section("What does not reproduce, and why", self.findings)
         for title, names in SECTIONS.items():

@@ -21,6 +21,7 @@ from tdof_npid_ros.output_file import hold
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores
 from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
+from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import make_optimizer, restore_optimizer
 from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
@@ -225,16 +226,28 @@ def tune_case(
     algorithm: str = "hga",
     population: int = POPULATION,
     generations: int = GENERATIONS,
+    constraints: Constraints | None = None,
 ) -> TuningResult:
-    """Tune one controller type on a case, in process, with the case's bounds and weight.
+    """Tune one controller type on a case, in process, with the case's bounds and weight, from random gains.
 
     Args:
         extra: `("sigma",)` to free sigma too.
+        constraints: margins that the loop must have; whether it has them, `feasible` says.
 
     Raises:
         TuningError: see `TuningProblem`.
     """
-    problem = TuningProblem(case, controller, extra, case.weight, algorithm, seed, population, generations)
+    problem = TuningProblem(
+        case,
+        controller,
+        extra,
+        case.weight,
+        algorithm,
+        seed,
+        population,
+        generations,
+        constraints=constraints or Constraints(),
+    )
     study = Study(problem)
     study.run(Objective(problem))
     return study.result
