@@ -14,6 +14,11 @@ from tdof_npid_ros.streams import prepare_streams
 
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {
+    "run": "all the loop's nodes in one command: play a case's episodes over ROS 2",
+    "live": "see and steer a loop in the browser",
+    "set": "set parameters or the setpoint of a running loop",
+    "get": "parameters and diagnostics of a running loop",
+    "reset": "let a running loop's plant begin once more",
     "new": "write a commented parameter file for a plant of your own",
     "check": "look at a parameter file as an experienced colleague would",
     "demo": "run the paper's first process over ROS 2, end to end",

@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 
+from tdof_npid_ros.analysis.compare import Comparison
 from tdof_npid_ros.cli.choice import add_choice, choice
 from tdof_npid_ros.graph.replay_node import replay
 from tdof_npid_ros.names import in_namespace
@@ -47,9 +48,11 @@ def run(arguments: argparse.Namespace) -> int:
     ros = ["--ros-args", "-r", f"__ns:={namespace}"]
     for name, value in parameters.items():
         ros += ["-p", f"{name}:={json.dumps(value)}"]
-    status, comparison = replay(["replay", *ros])
-    if arguments.json:
-        print(json.dumps(comparison.as_dict()))
-    elif comparison.lines():
-        print("\n".join(comparison.lines()))
-    return status
+
+    def tell(comparison: Comparison) -> None:
+        if arguments.json:
+            print(json.dumps(comparison.as_dict()), flush=True)
+        elif comparison.lines():
+            print("\n".join(comparison.lines()), flush=True)
+
+    return replay(["replay", *ros], tell)

@@ -7,6 +7,7 @@ The node is imported in here, so that Ctrl-C ends it at once and quietly, also w
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import signal
@@ -26,6 +27,20 @@ MODULES = {
 }
 
 
+PARENT = "TDOF_NPID_PARENT"  # environment variable: the process that this one must not outlive
+PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent() -> None:
+    """Have this process told to stop when the one that started it as a part of itself has ended, however it ended."""
+    parent = os.environ.pop(PARENT, "")
+    if not parent or sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)  # it holds for what this process executes, too
+    if str(os.getppid()) != parent:  # it has ended meanwhile
+        os._exit(0)
+
+
 def run(node: str, arguments: list[str]) -> None:
     """Run a node with its command line's arguments, the program's name first."""
     prepare_streams()
@@ -34,6 +49,7 @@ def run(node: str, arguments: list[str]) -> None:
         return
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
+    end_with_parent()
     importlib.import_module(f"tdof_npid_ros.graph.{MODULES[node]}").main(arguments)
 
 

@@ -14,6 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from tdof_npid_ros.graph.__main__ import PARENT
+from tdof_npid_ros.parameter_file import write_parameters
+
 STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
 
 
@@ -72,12 +75,20 @@ class NodeProcesses:
             self._end_by_themselves.add(node)
         command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "-r", f"__ns:={self._namespace}"]
         command += ["--params-file", str(self._parameter_file)]
-        for name, value in (parameters or {}).items():
-            command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+        if parameters:  # in a file, whose entries stand above the first one's whatever the namespace
+            path = self._logs / f"{node}.yaml"
+            plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
+            write_parameters(path, {node: plain})
+            command += ["--params-file", str(path)]
         with self.log(node).open("wb") as log, _interrupted_afterwards():
             # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
             self._processes[node] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env={**os.environ, PARENT: str(os.getpid())},
             )
 
     def log(self, node: str) -> Path:

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
@@ -51,6 +50,7 @@ class ReplayNode(LoopNode):
     def __init__(self) -> None:
         super().__init__("replay")
         given = self.declare_all(REPLAY)
+        self.tell: Callable[[Comparison], None] = lambda _: None
         self.bag = Path(given["bag"])
         self.rate, self.start = given["rate"], given["start"]
         self.loop, self.clock, self.compare = given["loop"], given["clock"], given["compare"]
@@ -220,34 +220,43 @@ class ReplayNode(LoopNode):
             if self.stopping.wait(0.02):
                 return
 
+    def finished(self, status: int) -> int:
+        """Tell what was compared; 1 if it failed, or differs without a reason."""
+        self.tell(self.comparison)
+        failed = self.comparison.failure or (self.compare and not self.comparison.sound)
+        return 1 if status == 0 and failed else status
+
     def state(self) -> tuple[int, str, dict[str, object]]:
         """What is replayed, and how the comparison stands."""
         facts: dict[str, object] = {"bag": self.bag, "rate": self.rate}
         return OK, f"replaying {self.bag}", facts | (self.comparison.as_dict() if self.compare else {})
 
 
-def replay(arguments: list[str]) -> tuple[int, Comparison]:
-    """Run the node to its end; returns its exit status and what it compared."""
-    nodes: list[ReplayNode] = []
+def replay(arguments: list[str], tell: Callable[[Comparison], None]) -> int:
+    """Run the node to its end; returns its exit status.
+
+    Args:
+        arguments: the command line, the program's name first.
+        tell: called with what was compared, at the node's end.
+    """
 
     def make() -> ReplayNode:
-        nodes.append(ReplayNode())
-        return nodes[0]
+        node = ReplayNode()
+        node.tell = tell
+        return node
 
-    status: Any = 0
     try:
         run_node(make, arguments)
     except SystemExit as end:
-        status = end.code or 0
-    comparison = nodes[0].comparison if nodes else Comparison()
-    if status == 0 and nodes and (comparison.failure or (nodes[0].compare and not comparison.sound)):
-        status = 1
-    return int(status), comparison
+        return int(end.code or 0)
+    return 0
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the node."""
-    status, comparison = replay(sys.argv if args is None else args)
-    with contextlib.suppress(BrokenPipeError):
-        print("\n".join(comparison.lines()), flush=True)
-    sys.exit(status)
+
+    def tell(comparison: Comparison) -> None:
+        with contextlib.suppress(BrokenPipeError):
+            print("\n".join(comparison.lines()), flush=True)
+
+    sys.exit(replay(sys.argv if args is None else args, tell))

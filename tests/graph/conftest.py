@@ -12,22 +12,19 @@ looks on from outside, and each has its remedy here:
 
 from __future__ import annotations
 
-import fcntl
-import itertools
 import math
 import os
-import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
+from dds_domain import reserved_domain
 
 from tdof_npid_ros.graph.runtime.middleware import PROFILE, RANGE, stay_on_this_machine
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
@@ -44,24 +41,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DOMAINS = range(1, 80)  # used in turn, so that a killed node's remains are gone when its domain comes round again
 START_TIMEOUT = 60.0  # s; generous, for a loaded machine
 ASK_AGAIN = 5.0  # s until a service that may be asked twice is asked again
 REPEAT_PERIOD = 0.1  # s between two times that `publish_until` publishes
-DOMAIN_NUMBERS = itertools.cycle(random.sample(DOMAINS, len(DOMAINS)))
-
-
-def reserved_domain() -> tuple[int, IO[str]]:
-    """A DDS domain that no other test on this machine uses now; it is free again when the file is closed."""
-    for domain in DOMAIN_NUMBERS:
-        file = (Path(tempfile.gettempdir()) / f"tdof-npid-domain-{domain}.lock").open("w")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-        else:
-            return domain, file
-    raise AssertionError("a cycle does not end")
 
 
 class NodeProcess:

@@ -71,6 +71,13 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def deactivate(self) -> None:
         """Stop working, before what `activate` created is destroyed."""
 
+    def finished(self, status: int) -> int:
+        """What is to be told at the end, while the process may still take its time; returns its exit status.
+
+        After this, it ends within seconds, wherever it is.
+        """
+        return status
+
     def checked(self, changes: dict[str, Any]) -> None:
         """Check a set of parameter changes as a whole; raise ValueError, with the reason, to refuse it."""
 

@@ -58,14 +58,20 @@ def run_node(
             with spun(node):
                 status = work(node, stop)
     except StartError as error:
-        print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
+        print(f"{_program()}: {error}", file=sys.stderr)
         status = 2
     finally:
         if node is not None:
-            _end(node, status)
+            status = _end(node, status)
         rclpy.try_shutdown()
         ignore_further_signals()
     sys.exit(status)
+
+
+def _program() -> str:
+    """What the user has called: `controller`, `tdof-npid`."""
+    name = sys.argv[0].rsplit("/", 1)[-1]
+    return sys.argv[1] if name == "__main__.py" and len(sys.argv) > 1 else name
 
 
 class StartError(RuntimeError):
@@ -92,13 +98,15 @@ def autostart(node: LoopNode) -> None:
         raise RuntimeError(one_line(node.activation_error)) from node.activation_error
 
 
-def _end(node: LoopNode, status: int) -> None:
+def _end(node: LoopNode, status: int) -> int:
     try:
         if node.active:
             node.deactivate()
+        status = node.finished(status)
     finally:
         end_within(LEAVE_TIMEOUT, status)
         node.destroy_node()
+    return status
 
 
 class Stop:

@@ -1,0 +1,36 @@
+"""`tdof-npid get`: parameters of a running node, and what the loop's nodes say of themselves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from tdof_npid_ros.cli.loop_client import add_loop_arguments, client_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument("names", nargs="*", metavar="NAME", help="parameters (default: all of the node)")
+    parser.add_argument("--diagnostics", action="store_true", help="what the loop's nodes say of themselves, instead")
+    add_loop_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print them."""
+    with client_of(arguments) as client:
+        found: dict[str, Any]
+        if arguments.diagnostics:
+            found = client.diagnostics()
+        else:
+            remote = client.remote(arguments.node)
+            names = arguments.names or sorted(remote.parameter_names())
+            found = remote.parameters(names)
+            missing = [name for name in arguments.names if found[name] is None]
+            if missing:
+                raise ValueError(f"{arguments.node} has no parameter {', '.join(missing)}, or one of them is not set")
+    if arguments.json:
+        print(json.dumps(found, default=str))
+    else:
+        print("\n".join(f"{name} = {value}" for name, value in found.items()))
+    return 0

@@ -1,0 +1,71 @@
+"""`tdof-npid run`: all the loop's nodes as processes, in one command."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from tdof_npid_ros.graph.running import RunningLoop
+
+BAR = "{desc} |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
+REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this subcommand's arguments."""
+    parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
+    parser.add_argument("--bag", type=Path, metavar="DIR", help="record to this new folder")
+    parser.add_argument("--realtime", action="store_true", help="on a steady clock (default: the file's mode)")
+    parser.add_argument("--for", type=float, dest="seconds", metavar="S", help="stop after so many seconds")
+    parser.add_argument("--namespace", default="/", help="where the nodes run (default: /)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Start the nodes, play the case's episodes, stop the nodes, and say where things are."""
+    from tdof_npid_ros.graph.running import run as running
+
+    if arguments.seconds is not None and not arguments.seconds > 0:
+        raise ValueError(f"--for {arguments.seconds:g}: it must be above 0 s")
+    started = time.monotonic()
+    mode: Literal["realtime"] | None = "realtime" if arguments.realtime else None
+    if not arguments.json:
+        print("Starting plant, controller and scenario …", flush=True)
+    with running(arguments.case, bag=arguments.bag, mode=mode, namespace=arguments.namespace) as loop:
+        if not loop.case.episodes:
+            raise ValueError(f"{arguments.case}: no episodes in it to play: give the scenario some")
+        finished = _play(loop, arguments.seconds, quiet=arguments.json)
+    if arguments.json:
+        bag = str(arguments.bag) if arguments.bag else None
+        elapsed = round(time.monotonic() - started, 3)
+        print(json.dumps({"case": loop.case.name, "finished": finished, "bag": bag, "elapsed_s": elapsed}))
+        return 0
+    print(f"{loop.case.name}: {'all episodes played' if finished else 'stopped before all episodes were played'}")
+    if arguments.bag:
+        print(f"bag      {arguments.bag}")
+        print(f"next     tdof-npid analyze {arguments.bag} --html report.html")
+        print(f"         tdof-npid verify {arguments.bag}")
+    return 0
+
+
+def _play(loop: RunningLoop, seconds: float | None, quiet: bool) -> bool:
+    """Play all episodes with a progress bar; whether they have ended by themselves."""
+    ends = [plan.end_ns / 1e9 for plan in loop.case.plans.values()]
+    deadline = None if seconds is None else time.monotonic() + seconds
+    loop.play()
+    first = loop.conductor.label.number if loop.conductor.label else 1
+    with tqdm(total=sum(ends), disable=None if not quiet else True, bar_format=BAR, mininterval=REDRAWN) as bar:
+        while loop.is_playing:
+            if deadline is not None and time.monotonic() > deadline:
+                return False
+            loop.idle(0.1)
+            done = min(max((loop.conductor.label.number if loop.conductor.label else first) - first, 0), len(ends) - 1)
+            position = sum(ends[:done]) + min(loop.conductor.time_ns / 1e9, ends[done])
+            bar.update(max(0.0, position - bar.n))
+        bar.update(bar.total - bar.n)
+    return True

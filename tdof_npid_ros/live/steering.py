@@ -1,0 +1,200 @@
+"""The hand on the loop: its parameters as they are now, changes of them, gains tried, margins.
+
+A thread of its own waits for the nodes, so no browser does.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, gains_from_mapping
+from tdof_npid_ros.control.options import OPTION_NAMES, options_from_mapping
+from tdof_npid_ros.graph.observer import LoopObserver
+from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, RefusedError
+from tdof_npid_ros.live.gain_history import GainHistory
+from tdof_npid_ros.parameter_file import write_parameters
+from tdof_npid_ros.parameters import sample_period_in_ns
+from tdof_npid_ros.plants.catalog import effort_limits, model_table
+from tdof_npid_ros.stability.margins import Margins, margins
+
+LOOK_PERIOD = 1.0  # s between two looks at the parameters: somebody else may change them, too
+CONTROLLER_NAMES = (*GAIN_NAMES, *OPTION_NAMES, "sample_period", "setpoint")
+
+
+class Steering:
+    """What can be changed in a loop, and what it is now.
+
+    Args:
+        observer: of the loop.
+        case: its parameter file, where the user named one: what a class of his own needs.
+
+    Attributes:
+        values: the controller's parameters; empty before it has answered.
+        plant: the plant's; empty where there is none that answers.
+        history: of the gains; None before the controller has answered.
+        problems: why a change was refused, by parameter; what is not a parameter bears its own name.
+        margins: of the gains now set; None where they are not known, and then `why_no_margins`.
+    """
+
+    def __init__(self, observer: LoopObserver, case: Case | None = None) -> None:
+        self._observer, self._case = observer, case
+        self.values: dict[str, Any] = {}
+        self.plant: dict[str, Any] = {}
+        self.history: GainHistory | None = None
+        self.problems: dict[str, str] = {}
+        self.margins: Margins | None = None
+        self.why_no_margins = "the plant's parameters are not known yet"
+        self._tasks: queue.Queue[Callable[[], None] | None] = queue.Queue()
+        self._margins_of: tuple[Any, ...] = ()
+        self._thread = threading.Thread(target=self._work, name="steering", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End, after what was asked for so far."""
+        self._tasks.put(None)
+        self._thread.join(timeout=10.0)
+
+    # Asked for by the page; none of these waits
+
+    def change(self, values: Mapping[str, Any]) -> None:
+        """Set parameters of the controller together; a refusal goes to `problems`, under each of them."""
+        self._tasks.put(lambda: self._change(dict(values)))
+
+    def undo(self) -> None:
+        """The gains before."""
+        self._again(self.history.undo() if self.history else None)
+
+    def redo(self) -> None:
+        """The gains that were undone."""
+        self._again(self.history.redo() if self.history else None)
+
+    def reset(self) -> None:
+        """Let the plant begin once more."""
+
+        def reset() -> None:
+            self._try("reset", lambda: self._observer.remote("plant").trigger("reset"))
+
+        self._tasks.put(reset)
+
+    def setpoint(self, value: float) -> None:
+        """Give a setpoint, on the topic."""
+        self._observer.publish("setpoint", [value])
+
+    def disturbance(self, value: float) -> None:
+        """Give a disturbance, on the topic."""
+        self._observer.publish("disturbance", [value])
+
+    def keep(self, path: Path) -> None:
+        """Write the controller's parameters as a file that every command takes.
+
+        Raises:
+            ParameterFileError: it cannot be written.
+        """
+        kept = {name: value for name, value in self.values.items() if name != "setpoint" and value is not None}
+        write_parameters(path, {"controller": kept})
+
+    # In the thread
+
+    def _work(self) -> None:
+        self._look()
+        while True:
+            try:
+                task = self._tasks.get(timeout=LOOK_PERIOD)
+            except queue.Empty:
+                self._look()
+                continue
+            if task is None:
+                return
+            task()
+            self._look()
+
+    def _try(self, what: str, action: Callable[[], object]) -> bool:
+        try:
+            action()
+        except (RefusedError, NoAnswerError) as error:
+            self.problems[what] = str(error).rpartition("refused ")[2]
+            return False
+        self.problems.pop(what, None)
+        return True
+
+    def _change(self, values: dict[str, Any]) -> None:
+        try:
+            self._observer.remote("controller").set_parameters(values)
+        except (RefusedError, NoAnswerError) as error:
+            reason = str(error).partition(": ")[2] or str(error)
+            self.problems |= dict.fromkeys(values, reason)
+            return
+        for name in values:
+            self.problems.pop(name, None)
+        self.values |= values
+        if self.history is not None:
+            self.history.note(self._gains())
+
+    def _again(self, gains: Mapping[str, float] | None) -> None:
+        if gains is not None:
+            self._tasks.put(lambda: self._restore(dict(gains)))
+
+    def _restore(self, gains: dict[str, Any]) -> None:
+        if self._try("undo", lambda: self._observer.remote("controller").set_parameters(gains)):
+            self.values |= gains
+
+    def _gains(self) -> dict[str, Any]:
+        return {name: self.values[name] for name in PER_LANE}
+
+    def _look(self) -> None:
+        """Whatever has changed: by us, or by somebody else."""
+        try:
+            found = self._observer.remote("controller").parameters(CONTROLLER_NAMES)
+        except NoAnswerError as error:
+            self.problems["controller"] = str(error)
+            return
+        self.problems.pop("controller", None)
+        if any(value is None for value in found.values()):
+            return
+        self.values = found
+        if self.history is None:
+            self.history = GainHistory(self._gains())
+        elif self.history.now != self._gains():
+            self.history.note(self._gains())
+        if not self.plant and self._observer.remote("plant").serves("reset"):
+            self._look_at_plant()
+        self._look_at_margins()
+
+    def _look_at_plant(self) -> None:
+        remote = self._observer.remote("plant")
+        try:
+            known = remote.parameters(["model", "effort_min", "effort_max", "lanes"])
+            model = str(known["model"])
+            if ":" in model and (self._case is None or self._case.model != model):
+                self.plant, self.why_no_margins = known, f"{model} is a class: name its parameter file to know it here"
+                return
+            self.plant = known | remote.parameters(list(model_table(model)))
+        except (NoAnswerError, RefusedError, ValueError) as error:
+            self.why_no_margins = str(error)
+
+    def _look_at_margins(self) -> None:
+        """Margins of what is in force, if that has changed."""
+        wanted = (tuple(sorted((k, str(v)) for k, v in self.values.items())), str(self.plant))
+        if wanted == self._margins_of or "model" not in self.plant:
+            return
+        self._margins_of = wanted
+        try:
+            gains, options = gains_from_mapping(self.values), options_from_mapping(self.values)
+            case = Case(
+                name="the loop",
+                sample_period_ns=sample_period_in_ns(self.values["sample_period"]),
+                model=str(self.plant["model"]),
+                plant_values=self.plant,
+                effort_limits=effort_limits(self.plant),
+                gains=gains,
+                episodes={},
+                options=options,
+            )
+            self.margins = margins(case, gains)
+        except ValueError as error:
+            self.margins, self.why_no_margins = None, str(error)

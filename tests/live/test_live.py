@@ -1,0 +1,200 @@
+"""The page in a real browser, on a loop of real processes: seen, steered, refused, undone, kept, and ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import chromium_page
+from dds_domain import reserved_domain
+
+from tdof_npid_ros.case import load_case
+from tdof_npid_ros.parameter_file import read_parameters
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+START_TIMEOUT = 90.0
+pytestmark = pytest.mark.timeout(240)
+
+
+class Program:
+    """`tdof-npid live` in a folder of its own."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        number, self._domain = reserved_domain()
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        self.folder = folder
+        command = [sys.executable, "-m", "tdof_npid_ros", "live", *arguments, "--no-browser", "--json"]
+        self._errors = (folder / "errors.txt").open("w")
+        self.process = subprocess.Popen(
+            command, cwd=folder, env=self.environment, stdout=subprocess.PIPE, stderr=self._errors, text=True
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, (folder / "errors.txt").read_text()
+        self.url = str(json.loads(line)["url"])
+
+    def tdof_npid(self, *arguments: str) -> Any:
+        """What another subcommand says of the loop, as JSON."""
+        command = [sys.executable, "-m", "tdof_npid_ros", *arguments, "--namespace", "/live", "--json"]
+        done = subprocess.run(
+            command, env=self.environment, cwd=self.folder, capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    def nodes(self) -> list[int]:
+        """Processes that it has started and that still run."""
+        found = subprocess.run(
+            ["pgrep", "-f", "tdof_npid_ros.graph .*__ns:=/live"], capture_output=True, text=True
+        ).stdout
+        mine = f"ROS_DOMAIN_ID={self.environment['ROS_DOMAIN_ID']}\0"
+        return [pid for pid in map(int, found.split()) if mine in _environment_of(pid)]
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """Signal it, and wait for its end; its status."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        status = self.process.wait(timeout=60)
+        self._errors.close()
+        return status
+
+
+def _environment_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/environ").read_text(errors="replace") + "\0"
+    except OSError:
+        return ""
+
+
+def eventually(condition: Any, what: Any, timeout: float = 90.0) -> None:
+    """Wait for a condition; `what` is told if it does not come, a function's result as it is then."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, what() if callable(what) else what
+        time.sleep(0.1)
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Iterator[Program]:
+    one = Program(tmp_path, "p1-c0.5")
+    yield one
+    one.stop()
+
+
+def model(page: Any, name: str, expression: str) -> Any:
+    """Evaluate an expression of a widget `w` by its name."""
+    return page.evaluate(
+        f"(() => {{ const w = Bokeh.documents[0].get_model_by_name('{name}'); return {expression}; }})()"
+    )
+
+
+def opened(page: Any, url: str) -> None:
+    page.goto(url, timeout=60_000)
+    page.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle", timeout=60_000)
+    page.wait_for_function("Bokeh.documents[0].get_model_by_name('kp_field').value !== null", timeout=60_000)
+
+
+@needs_chromium
+def test_the_page_sees_and_steers_the_loop(program: Program) -> None:
+    assert CHROMIUM
+    with chromium_page(CHROMIUM, width=1280) as page:
+        opened(page, program.url)
+        assert model(page, "kp_field", "w.value") == load_case("p1-c0.5").gains.kp
+
+        model(page, "setpoint_field", "w.value = 1.0")
+        numbers = lambda: str(model(page, "numbers", "w.text"))  # noqa: E731
+        said = lambda: numbers() + str(model(page, "nodes", "w.text"))  # noqa: E731
+        eventually(lambda: "overshoot" in numbers() and "M_s 2.3" in numbers(), said)
+
+        model(page, "kp_field", "w.value = 5.0")
+        eventually(lambda: program.tdof_npid("get", "kp")["kp"] == 5.0, "the controller's kp follows the field")
+        eventually(lambda: abs(10 ** float(model(page, "kp", "w.value")) - 5.0) < 0.01, "the slider follows the field")
+
+        model(page, "kp_field", "w.value = -5.0")  # against the other gains' signs
+        eventually(
+            lambda: (
+                "differ in sign" in page.content()
+                or "differ in sign" in str(page.evaluate("JSON.stringify(Bokeh.documents[0].to_json())"))
+            ),
+            "the reason stands on the page",
+        )
+        assert program.tdof_npid("get", "kp")["kp"] == 5.0
+        eventually(lambda: model(page, "kp_field", "w.value") == 5.0, "the field shows what is in force")
+
+        model(page, "undo", "w.trigger_event ? 0 : 0")
+        page.get_by_role("button", name="undo").click()
+        eventually(lambda: program.tdof_npid("get", "kp")["kp"] == load_case("p1-c0.5").gains.kp, "undo restores kp")
+
+        page.get_by_role("button", name="keep").click()
+        eventually(lambda: list(program.folder.glob("gains-*.yaml")), "keep writes a file")
+        (kept,) = program.folder.glob("gains-*.yaml")
+        assert read_parameters(kept, "controller")["kp"] == load_case("p1-c0.5").gains.kp
+        simulate = [sys.executable, "-m", "tdof_npid_ros", "simulate", "p1-c0.5", "--gains", str(kept), "--json"]
+        assert subprocess.run(simulate, capture_output=True, timeout=100).returncode == 0
+
+
+@needs_chromium
+def test_at_a_phones_width_everything_can_be_reached(program: Program) -> None:
+    assert CHROMIUM
+    with chromium_page(CHROMIUM, width=390, height=800, has_touch=True) as page:
+        opened(page, program.url)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        for name in ("undo", "keep", "step up", "reset the plant", "by hand"):
+            button = page.get_by_role("button", name=name)
+            button.scroll_into_view_if_needed()
+            box = button.bounding_box()
+            assert box and box["x"] >= 0 and box["x"] + box["width"] <= 390, name
+
+
+def test_without_the_token_nothing_is_served(program: Program) -> None:
+    root, _, token = program.url.rstrip("/").rpartition("/")
+    for path in ("/", "/static/js/bokeh.min.js", "/ws", f"/{token[:-1]}x/"):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(root + path, timeout=10)
+        assert refused.value.code in (404, 405)
+
+
+def test_a_foreign_origin_is_refused(program: Program) -> None:
+    address = urllib.parse.urlsplit(program.url)
+    origins = {"http://evil.example": "403", f"http://{address.netloc}": ""}
+    for origin, refused in origins.items():
+        with socket.create_connection(("127.0.0.1", address.port or 0), timeout=30) as connection:
+            lines = (
+                f"GET {address.path}ws HTTP/1.1", f"Host: {address.netloc}", f"Origin: {origin}", "Upgrade: websocket",
+                "Connection: Upgrade", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
+            )  # fmt: skip
+            connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+            status = connection.recv(64).split()[1].decode()
+        assert (status == "403") == bool(refused), (origin, status)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_what_it_started_ends_with_it_however_it_ends(tmp_path: Path, number: int) -> None:
+    program = Program(tmp_path, "p1-c0.5")
+    eventually(lambda: len(program.nodes()) == 3, "three nodes run")
+    program.stop(number)
+    eventually(lambda: not program.nodes(), "no node is left", timeout=30)
+
+
+def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        command = [sys.executable, "-m", "tdof_npid_ros", "live", "--join", "/nobody", "--port", port, "--no-browser"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and f"port {port} cannot be had" in done.stderr
