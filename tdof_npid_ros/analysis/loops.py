@@ -288,7 +288,8 @@ def _tracks(reader: BagReader, roles: _Roles) -> _Tracks:
         if not acted_on.layouts or (roles.setpoint is not None and roles.setpoint.told):
             acted_on = None
     topic = roles.namespace + DISTURBANCE
-    has_disturbance = topic in reader.topics and reader.topics[topic].type == JOINT_STATE
+    is_there = topic in reader.topics and topic not in reader.unreadable
+    has_disturbance = is_there and reader.topics[topic].type == JOINT_STATE
     disturbance = read_track(reader, Source("effort", _field(topic, "effort"))) if has_disturbance else None
     return _Tracks(output, setpoint, effort, acted_on, disturbance)
 

@@ -16,6 +16,7 @@ from tdof_npid_ros.parameters import sample_period_in_ns
 from tdof_npid_ros.scenario import Plan, parse_plan, read_episodes
 
 TOPIC = "/parameter_events"
+TYPE = "rcl_interfaces/msg/ParameterEvent"
 # The field of rcl_interfaces/msg/ParameterValue that holds the value, by its `type`.
 VALUE_FIELDS = {
     1: "bool_value",
@@ -63,7 +64,7 @@ def read_histories(reader: BagReader) -> dict[str, ParameterHistory]:
     Raises:
         BagError: the bag is damaged.
     """
-    if TOPIC not in reader.topics:
+    if TOPIC not in reader.topics or TOPIC in reader.unreadable or reader.topics[TOPIC].type != TYPE:
         return {}
     columns = reader.columns(TOPIC, ["node", "new_parameters", "changed_parameters"])
     events: dict[str, list[tuple[int, dict[str, Any]]]] = {}

@@ -155,7 +155,7 @@ def _plans(reader: BagReader, topic: str) -> tuple[dict[str, Plan], list[tuple[i
     node refused."""
     plans: dict[str, Plan] = {}
     times: list[tuple[int, str]] = []
-    if topic not in reader.topics or reader.topics[topic].type != JOINT_TRAJECTORY:
+    if topic not in reader.topics or topic in reader.unreadable or reader.topics[topic].type != JOINT_TRAJECTORY:
         return plans, times
     for _, publish_ns, message in reader.decoded(topic):
         points = [point["time_from_start"] for point in message["points"]]

@@ -50,7 +50,7 @@ def check_messages(reader: BagReader, loop: Loop, terms: Terms, account: Verific
 def _check_plans(reader: BagReader, loop: Loop, planned: set[str], account: Verification) -> None:
     """A plan's message bears the digest of its content, and the scenario's parameters make it."""
     topic = f"{loop.namespace}scenario_plan"
-    if topic not in reader.topics or reader.topics[topic].type != JOINT_TRAJECTORY:
+    if topic not in reader.topics or topic in reader.unreadable or reader.topics[topic].type != JOINT_TRAJECTORY:
         return
     for step, (_, _, message) in enumerate(reader.decoded(topic)):
         told = message["header"]["frame_id"]
@@ -89,7 +89,7 @@ def _digests_of_scenario(loop: Loop) -> set[str]:
 def _check_signal(reader: BagReader, loop: Loop, name: str, field: str, account: Verification) -> None:
     """In lockstep the scenario's signals are the plan's, by their stamps."""
     topic = loop.namespace + name
-    if topic not in reader.topics or reader.topics[topic].type != JOINT_STATE:
+    if topic not in reader.topics or topic in reader.unreadable or reader.topics[topic].type != JOINT_STATE:
         return
     signal = signal_of(reader, topic)
     if not loop.plans:
@@ -113,7 +113,7 @@ def _bytes(values: set[float]) -> set[bytes]:
 def _check_terms(reader: BagReader, loop: Loop, terms: Terms, old: bool, account: Verification) -> None:
     """`controller_state` holds the terms that the answers were made of."""
     topic = f"{loop.namespace}controller_state"
-    if topic not in reader.topics or reader.topics[topic].type != JOINT_STATE:
+    if topic not in reader.topics or topic in reader.unreadable or reader.topics[topic].type != JOINT_STATE:
         return
     signal = signal_of(reader, topic)
     waiting = {stamp: deque(found) for stamp, found in terms.items()}

@@ -13,6 +13,7 @@ from foreign_bags import (
     JOINT_STATE,
     START_NS,
     STATE,
+    STORE,
     TAU,
     float64,
     floats,
@@ -29,6 +30,7 @@ from tdof_npid_ros.analysis.compare import Recorded
 from tdof_npid_ros.analysis.report import Report, analyze
 from tdof_npid_ros.analysis.sources import Chosen
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.metrics import SetpointMetrics
 from tdof_npid_ros.responses import Response
@@ -392,3 +394,43 @@ def test_the_loop_to_compare_a_live_controller_with_may_be_named(tmp_path) -> No
         assert (recorded.output, recorded.setpoint, len(recorded.answers)) == ("/arm/measured", "/arm/measured", 100)
         with pytest.raises(AnalysisError, match="no topic /arm/v"):
             Recorded.read(reader, str(bag), Chosen.read("/arm/measured", None, "/arm/v"))
+
+
+def test_a_publish_time_of_0_is_no_time(tmp_path) -> None:
+    told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    with BagWriter(tmp_path / "bag") as writer:
+        topics = {topic: writer.add_topic(topic, type_name) for _, topic, type_name, _ in told}
+        for time_ns, topic, type_name, message in sorted(told, key=lambda one: one[0]):
+            data = bytes(STORE.serialize_cdr(message, type_name))
+            writer.write(topics[topic], data, START_NS + time_ns, 0, 0)
+    (response,) = by_joint(analyze([tmp_path / "bag"]))["a"]
+    assert is_the_step(response)
+
+
+def test_publishers_whose_clocks_differ_are_put_in_order_by_the_log(tmp_path) -> None:
+    """The robot's clock is an hour ahead of that of the setpoints."""
+    told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    with BagWriter(tmp_path / "bag") as writer:
+        topics = {topic: writer.add_topic(topic, type_name) for _, topic, type_name, _ in told}
+        for time_ns, topic, type_name, message in sorted(told, key=lambda one: one[0]):
+            data = bytes(STORE.serialize_cdr(message, type_name))
+            ahead = 3600 * 10**9 if topic == "/joint_states" else 0
+            writer.write(topics[topic], data, START_NS + time_ns, START_NS + time_ns + ahead, 0)
+    report = analyze([tmp_path / "bag"])
+    (response,) = by_joint(report)["a"]
+    assert is_the_step(response) and "clocks differ" in report.table()
+
+
+def test_where_all_is_logged_at_one_time_the_stamps_do(tmp_path) -> None:
+    told = [
+        (t, "/setpoint", JOINT_STATE, joints({"a": r}, START_NS + t)) for t, r in ((0, 0.0), (10**9 - 1000, 1.0))
+    ] + measured({"a": STEP})
+    report = analyze([write(tmp_path / "bag", [(0, *message[1:]) for message in told])])
+    (response,) = by_joint(report)["a"]
+    assert is_the_step(response) and "one receive time" in report.table()
+
+
+def test_parameter_events_of_another_type_spoil_nothing(tmp_path) -> None:
+    odd = [(0, "/parameter_events", FLOAT64, float64(1.0)), (0, "/scenario_plan", FLOAT64, float64(1.0))]
+    told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    assert is_the_step(by_joint(analyze([write(tmp_path / "bag", odd + told)]))["a"][0])
