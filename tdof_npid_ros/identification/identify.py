@@ -10,15 +10,21 @@ import numpy as np
 from scipy import stats
 
 from tdof_npid_ros.identification import IdentificationError
-from tdof_npid_ros.identification.fit import Problem, Solution, Stretch
+from tdof_npid_ros.identification.fit import NO_WHITENING, Problem, Solution, Stretch
 from tdof_npid_ros.identification.intervals import Interval, intervals
-from tdof_npid_ros.identification.noise import autocovariance, autoregression, roughness
-from tdof_npid_ros.identification.search import Fitted, chosen, criterion, fit_all, floor
+from tdof_npid_ros.identification.noise import autocovariance, roughness
+from tdof_npid_ros.identification.search import WORTH, Fitted, chosen, criterion, fit_all, floor, noise_model
 from tdof_npid_ros.identification.structures import STRUCTURES, Structure
 
 LEAST_SAMPLES = 40
 WORKING = 3000  # samples, in which structures are compared; of longer records, averages or a part
 RESOLVED = 8.0  # averages: what a plant's dead time and time constant together must last, or fewer are averaged
+ALL_STRUCTURES = 50_000  # samples; of longer records not every structure is fitted to all samples …
+FEW_STRUCTURES = 2  # … but so many
+FULL_ITERATIONS = 12
+ARITHMETIC = 100.0  # of the smallest sum of squares: what the intervals count as noise at the least
+STEADY = 0.05  # of the effort's range: less is no move
+LONGEST_START = 0.25  # of a stretch: more is not left out
 FOLDS = 2
 FOLD_BLOCKS = 20  # parts of a stretch; every other one is left out in turn, but for the first: all begins there
 SIGNIFICANCE = 1e-6  # that the output follows the effort at all
@@ -109,10 +115,12 @@ def identify(stretches: Sequence[Stretch], structures: Sequence[Structure] = tup
         IdentificationError: the record cannot tell; the message says why, and what to record instead.
     """
     _check(stretches)
-    working, averages = _working(stretches)
-    fits, _ = fit_all(working, structures)
-    fit = chosen(fits)
-    final, whitening = _final(fit, stretches, reused=working is stretches)
+    fits, whitening, averages = _fitted(stretches, structures)
+    without_starts = _without_starts(stretches, chosen(fits).solution.point.dead_time)
+    if without_starts is not None:
+        stretches = without_starts
+        fits, whitening, averages = _fitted(stretches, structures)
+    final = chosen(fits)
     structure, solution = final.problem.structure, final.solution
     residuals = final.problem.residuals(solution)
     best = fits[0].criterion
@@ -121,7 +129,7 @@ def identify(stretches: Sequence[Stretch], structures: Sequence[Structure] = tup
     covariance = autocovariance(white, min(LAGS, min(map(len, white)) // 2))
     found = Identified(
         structure,
-        _reason(fit, fits),
+        _reason(final, fits),
         intervals(final.problem, _with_floor(final, stretches)),
         candidates,
         [
@@ -130,7 +138,7 @@ def identify(stretches: Sequence[Stretch], structures: Sequence[Structure] = tup
             if there
         ],
         _held_out_fit(final.problem, solution),
-        math.sqrt(float(np.mean(np.concatenate(residuals) ** 2))),
+        math.sqrt(float(np.mean(np.concatenate([r[s.used] for r, s in zip(residuals, stretches, strict=True)]) ** 2))),
         whitening,
         float(np.max(np.abs(covariance[1:]), initial=0.0) / covariance[0]) if covariance[0] > 0.0 else 0.0,
         2.58 / math.sqrt(sum(map(len, white))),
@@ -169,6 +177,31 @@ def _check(stretches: Sequence[Stretch]) -> None:
         raise IdentificationError(
             "the output never moves: make the step larger, or check that this output is the one that the effort drives"
         )
+
+
+def _fitted(stretches: Sequence[Stretch], structures: Sequence[Structure]) -> tuple[list[Fitted], np.ndarray, int]:
+    """All structures' fits to all samples, the noise's model, and how many samples were averaged to search for them."""
+    working, averages = _working(stretches)
+    fits, whitening = fit_all(working, structures)
+    if working is not stretches:
+        fits, whitening = _on_all_samples(fits, stretches)
+    return fits, whitening, averages
+
+
+def _without_starts(stretches: Sequence[Stretch], dead_time: float) -> list[Stretch] | None:
+    """The stretches without the dead time at the start of each that begins in the midst of things; None: none does.
+
+    What the effort was before a record, nobody knows. If it is steady at first, it will have been so before; if
+    not, the
+    outputs that come from then tell nothing.
+    """
+    kept = []
+    for stretch in stretches:
+        first = stretch.time < min(dead_time + 2.0 * stretch.period, LONGEST_START * stretch.duration)
+        moved = np.abs(stretch.effort[first] - stretch.effort[0]) > STEADY * np.ptp(stretch.effort)
+        midst = not stretch.at_rest and dead_time > 0.0 and bool(moved.any())
+        kept.append(replace(stretch, used=stretch.used & ~first) if midst else stretch)
+    return kept if any(a is not b for a, b in zip(kept, stretches, strict=True)) else None
 
 
 def _working(stretches: Sequence[Stretch]) -> tuple[Sequence[Stretch], int]:
@@ -218,31 +251,40 @@ def _liveliest(stretch: Stretch, samples: int) -> Stretch:
     )
 
 
-def _final(fit: Fitted, stretches: Sequence[Stretch], reused: bool) -> tuple[Fitted, np.ndarray]:
-    """The fit to all samples, with the noise that all of them show."""
-    if reused:
-        return fit, fit.problem.whitening
-    problem = Problem(fit.structure, stretches, (False,) * len(stretches))
+def _on_all_samples(fits: Sequence[Fitted], stretches: Sequence[Stretch]) -> tuple[list[Fitted], np.ndarray]:
+    """The fits made again to all samples, with the noise that all of them show: of a very long record the best ones."""
+    count = sum(len(stretch.time) for stretch in stretches)
+    likely = list(fits) if count <= ALL_STRUCTURES else list(fits[:FEW_STRUCTURES])
+    if (simplest := chosen(fits)) not in likely:
+        likely[-1] = simplest
+    again = [_refitted(fit, stretches, NO_WHITENING) for fit in likely]
+    best = min(again, key=lambda fit: fit.criterion)
+    whitening = noise_model(best)
+    if len(whitening):
+        again = [_refitted(fit, stretches, whitening) for fit in again]
+    return sorted(again, key=lambda fit: fit.criterion), whitening
+
+
+def _refitted(fit: Fitted, stretches: Sequence[Stretch], whitening: np.ndarray) -> Fitted:
+    """A fit made again on all samples, with its load steps if they still are worth it."""
+    problem = Problem(fit.structure, stretches, (False,) * len(stretches), whitening)
     start = problem.unloaded()
     start = replace(start, shape=fit.solution.point.shape, dead_time=fit.solution.point.dead_time)
-    whole = all(
-        w.duration + 3.0 * w.period >= s.duration for w, s in zip(fit.problem.stretches, stretches, strict=True)
-    )
-    if whole and any(fit.problem.loaded):
-        problem = replace(problem, loaded=fit.problem.loaded)
-        start = replace(start, load_time=fit.solution.point.load_time, load=fit.solution.point.load)
-    solution = problem.refined(start, 8, 1e-7)
-    residuals = problem.residuals(solution)
-    if solution.rss > 10.0 * floor(stretches):
-        whitening = autoregression(residuals)
-        if len(whitening):
-            problem = replace(problem, whitening=whitening)
-            solution = problem.refined(solution.point, 5, 1e-7)
-    return Fitted(problem, solution, criterion(problem, solution)), problem.whitening
+    solution = problem.refined(start, FULL_ITERATIONS, 1e-7)
+    plain = Fitted(problem, solution, criterion(problem, solution))
+    spans = zip(fit.problem.stretches, stretches, strict=True)
+    if not any(fit.problem.loaded) or any(part.duration + 3.0 * part.period < all_.duration for part, all_ in spans):
+        return plain
+    problem = replace(problem, loaded=fit.problem.loaded)
+    start = replace(start, load_time=fit.solution.point.load_time, load=fit.solution.point.load)
+    solution = problem.refined(start, FULL_ITERATIONS, 1e-7)
+    loaded = Fitted(problem, solution, criterion(problem, solution))
+    return loaded if loaded.criterion < plain.criterion - WORTH else plain
 
 
 def _with_floor(fit: Fitted, stretches: Sequence[Stretch]) -> Solution:
-    return replace(fit.solution, rss=fit.solution.rss + floor(stretches))
+    """With residuals that are not below what the arithmetic gives."""
+    return replace(fit.solution, rss=fit.solution.rss + ARITHMETIC * floor(stretches))
 
 
 def _reason(fit: Fitted, fits: Sequence[Fitted]) -> str:
