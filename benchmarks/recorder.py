@@ -93,7 +93,7 @@ def run_loop(folder: Path, steps: int, recording: dict[str, Any] | None, lanes: 
     file.write_text(
         f"/**: {{ros__parameters: {{sample_period: {period}, mode: lockstep}}}}\n"
         f"/**/plant: {{ros__parameters: {{lanes: {lanes}}}}}\n"
-        f"/**/controller: {{ros__parameters: {{kp: {[9.4] * lanes}, ki: 9.4, kd: 2.1, alpha: 0.3}}}}\n"
+        f"/**/controller: {{ros__parameters: {{kp: {[9.4] * lanes}, ki: 9.4, kd: 2.1, alpha: 0.3, sigma: 1.0}}}}\n"
         "/**/scenario: {ros__parameters: {play: false, episodes: [warm_up, run], plan: {"
         f'warm_up: ["0 setpoint 1", "{WARM_UP * period} end"], run: ["0 setpoint 1", "{steps * period} end"]}}}}}}\n'
     )

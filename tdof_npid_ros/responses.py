@@ -119,8 +119,8 @@ def _changes(lane: Lane, first: int) -> list[_Change]:
     """What changes, in order; where several things change at once, the setpoint before disturbance and plant."""
     found = {at: _Change(at, "plant") for at in lane.plant_changes if at >= first}
     for at, kind in _disturbance_changes(lane):
-        if at >= first:
-            found[at] = _Change(at, kind)
+        if at >= first - PATH_GAP:  # in realtime it may come just before the setpoint of the same episode
+            found[max(at, first)] = _Change(max(at, first), kind)
     for change in _setpoint_changes(lane, first):
         found[change.at] = change
     return [found[at] for at in sorted(found)]

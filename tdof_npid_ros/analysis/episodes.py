@@ -13,6 +13,7 @@ import numpy as np
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.loops import ObservedLoop, observed_loops
 from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations, scenario_plans
+from tdof_npid_ros.analysis.recording import PLAN_AFTER_RESET_NS
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.analysis.tracks import Key, Track, held, matched
 from tdof_npid_ros.bag.reader import BagReader
@@ -283,6 +284,7 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
         disturbance = np.nan_to_num(sampling.live(loop.disturbance, keys)[0])  # before the first there is none
         if view.label is not None:
             digest = loop.plan_followed(start_ns)
+            _forget_the_episode_before(setpoint, loop.plans.get(digest), grid)
     return Episode(
         bag=loop.bag,
         namespace=loop.namespace,
@@ -319,6 +321,17 @@ def _is_start(view: _View, first_stamp_ns: int, plant: Mapping[str, object], out
     # Of a recording that begins within an episode, the first output is not the plant's initial one.
     off = np.abs(output[0] - _initial_output(plant, output))
     return not view.is_first or bool((off <= _noise_bound(plant)).all())
+
+
+def _forget_the_episode_before(setpoint: np.ndarray, plan: Plan | None, grid: np.ndarray) -> None:
+    """In realtime the plant is reset first, and then the plan's first setpoint comes: until it does, there is none."""
+    if plan is None:
+        return
+    soon = int(np.searchsorted(grid, grid[0] + PLAN_AFTER_RESET_NS))
+    for lane in range(setpoint.shape[1]):
+        planned = np.flatnonzero(setpoint[:soon, lane] == plan.value_at("setpoint", 0))
+        if planned.size:
+            setpoint[: planned[0], lane] = np.nan
 
 
 class _Sampling(NamedTuple):

@@ -14,7 +14,7 @@ from tdof_npid_ros.identification.noise import autoregression
 from tdof_npid_ros.identification.structures import STRUCTURES, Structure
 
 COARSE = 300  # samples, for the search
-STARTS = 3  # that are followed to their minimum
+STARTS = 3  # that are followed to their minimum, for each coefficient of the numerator
 LOAD_TIMES = 40  # candidates in a stretch
 LOAD_PARAMETERS = 3  # its size, its time, and one for having looked everywhere
 WORTH = 10.0  # of the criterion: a structure with more parameters must be that much better (Burnham and Anderson 2002)
@@ -79,7 +79,8 @@ def noise_model(fit: Fitted) -> np.ndarray:
     """How the residuals are correlated; as if white where they are below what can be resolved."""
     if fit.solution.rss <= 10.0 * floor(fit.problem.stretches):
         return NO_WHITENING
-    return autoregression(fit.problem.residuals(fit.solution))
+    residuals = fit.problem.residuals(fit.solution)
+    return autoregression([r[stretch.used] for r, stretch in zip(residuals, fit.problem.stretches, strict=True)])
 
 
 def floor(stretches: Sequence[Stretch]) -> float:
@@ -178,7 +179,7 @@ def _starts(problem: Problem, loads: Point) -> list[Point]:
         index, shape, dead_time = grid[at]
         if all(max(abs(a - b) for a, b in zip(index, other, strict=True)) > 1 for other, _ in taken):
             taken.append((index, replace(loads, shape=np.array(shape), dead_time=dead_time)))
-            if len(taken) == STARTS:
+            if len(taken) == STARTS * problem.structure.numerators:
                 break
     return [point for _, point in taken]
 

@@ -45,14 +45,15 @@ class Creep:
         from_sigma_s: seconds that the error takes from so many σ down to 1 σ; within some 4 % from 3 σ on.
         largest_step: of the setpoint in the case's plans, in y; `error_left` what the rest of the loop leaves of it,
             and `step_s` the seconds from there down to 1 σ: 0 if it leaves less.
+            Of both None is a time beyond all numbers.
         setpoint_ramp, disturbance_ramp: the fastest that the integral action can follow, in y/s and u/s. None: any.
     """
 
     time_constant_s: float
-    from_sigma_s: dict[str, float]
+    from_sigma_s: dict[str, float | None]
     largest_step: float
     error_left: float
-    step_s: float
+    step_s: float | None
     setpoint_ramp: float | None
     disturbance_ramp: float
 
@@ -103,8 +104,9 @@ class Certificate:
 
     def as_dict(self) -> dict[str, Any]:
         """Name to value, for JSON: numbers, null, texts, lists."""
-        document: dict[str, Any] = _finite(asdict(self))
-        return document | {"margins": self.margins.as_dict() if self.margins else None}
+        margins = self.margins.as_dict() if self.margins else None
+        lists = {name: list(getattr(self, name)) for name in ("reasons", "claim", "not_claimed")}
+        return {**asdict(self), **lists, "margins": margins}
 
     def lines(self) -> list[str]:
         """For people."""
@@ -307,8 +309,8 @@ def _creep(case: Case, plant: PulseTransfer, gains: Gains, found: Certificate) -
     tau = abs((1.0 / gain + kp) / ki)
     assert found.re_g_zero is not None
 
-    def down_to_sigma(error: float) -> float:
-        return creep_time(error, sigma, sigma, tau, found.re_g_zero or 0.0) if error > sigma else 0.0
+    def down_to_sigma(error: float) -> float | None:
+        return _or_none(creep_time(error, sigma, sigma, tau, found.re_g_zero or 0.0)) if error > sigma else 0.0
 
     step = case.largest_step
     left = error_left(step, kp, alpha, gain)
@@ -348,10 +350,14 @@ def _words(found: Certificate, gains: Gains, creep: Creep | None) -> tuple[tuple
     if creep is not None:
         not_claimed.append(
             "No speed is claimed: of errors much larger than sigma the law integrates next to nothing. From 5 sigma "
-            f"to 1 sigma the output creeps for {creep.from_sigma_s['5']:.3g} s, from 3 sigma for "
-            f"{creep.from_sigma_s[f'{ACCURATE_FROM:g}']:.3g} s. The largest setpoint step of the plans, "
+            f"to 1 sigma the output creeps for {_seconds(creep.from_sigma_s['5'])}, from 3 sigma for "
+            f"{_seconds(creep.from_sigma_s[f'{ACCURATE_FROM:g}'])}. The largest setpoint step of the plans, "
             f"{creep.largest_step:g}, leaves an error of {creep.error_left:.3g} to the integral action"
-            + (f", which takes {creep.step_s:.3g} s to come down to sigma." if creep.step_s else ", below sigma.")
+            + (
+                ", below sigma."
+                if creep.step_s == 0.0
+                else f", which takes {_seconds(creep.step_s)} to come down to sigma."
+            )
         )
         ramp = "" if creep.setpoint_ramp is None else f"a setpoint ramp of {creep.setpoint_ramp:.3g} per second or "
         not_claimed.append(
@@ -361,10 +367,5 @@ def _words(found: Certificate, gains: Gains, creep: Creep | None) -> tuple[tuple
     return tuple(claim), tuple(not_claimed)
 
 
-def _finite(value: Any) -> Any:
-    """The value with infinities as None, and tuples as lists: what JSON can say."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _seconds(time: float | None) -> str:
+    return "longer than any number" if time is None else f"{time:.3g} s"

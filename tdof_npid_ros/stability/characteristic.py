@@ -17,7 +17,7 @@ RIGHT = 1.0  # rad: most that the function may turn between two points of a coun
 SURE = 1e-6  # relative, in that distance: within which an estimate is confirmed
 NEAREST = 1e-15  # distance of a mode to the circle, below which it counts as on it
 FARTHEST = 1.0 - 1e-9  # inside the circle: modes nearer to z = 0 die out at once
-CLOSE = 1e-9  # relative, in the distance to the circle: how near the slowest mode is found
+CLOSE = 1e-6  # relative, in the distance to the circle: how near the slowest mode is found
 
 
 @dataclass(frozen=True)

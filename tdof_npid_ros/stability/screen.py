@@ -426,7 +426,9 @@ def _crossover(response: Any, c: Any, margins: Any, lane: Any, low: Any, before:
         if abs(to_axis) <= abs(turn) and turn != 0.0:
             part = to_axis / turn
             meets = _loop_between(response, c, low, high, part)
-            off = _angle(-meets)  # what is left to the axis, by the slope of the whole stretch
+            part -= _angle(-meets) / turn  # what is left to the axis, by the slope of the whole stretch
+            meets = _loop_between(response, c, low, high, part)
+            off = _angle(-meets)
             _gain(margins, lane, math.exp(0.5 * math.log(_squared(meets)) - off / turn * growth))
     size = 0.5 * math.log(_squared(before))
     if (size >= 0.0) != (size + growth >= 0.0):

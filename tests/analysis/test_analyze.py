@@ -348,3 +348,22 @@ def test_a_realtime_run_of_a_plan_is_the_same_episode_as_one_in_lockstep(bag, tm
     (response,) = report.episodes[2].responses[0]
     assert response.kind == "setpoint" and response.start_s == 0.0
     assert response.metrics.overshoot_percent == case.setpoint_response().overshoot_percent
+
+
+def test_in_realtime_the_setpoint_of_the_episode_before_is_none_of_this_one(tmp_path, case) -> None:
+    """The plant's first output is answered before the plan's first setpoint has come."""
+    run, plan = case.simulate("disturbance"), case.plans["disturbance"]
+    with LoopBag(tmp_path / "realtime") as writer:
+        writer.configuration(case, case.gains)
+        for k in range(1001):
+            if k == 2:
+                writer.write("scenario_plan", TRAJECTORY, plan_message(plan))
+                writer.write("disturbance", JOINT_STATE, joint_state(0, "", (), [1.0]))
+            label, stamp = "-/0011aabb.2", k * case.sample_period_ns
+            writer.write("output", JOINT_STATE, joint_state(stamp, label, run.output[max(k - 2, 0)], [0.0]))
+            answer = joint_state(stamp, f"abc {label}", [0.0 if k > 2 else 1.0], run.control_effort[k])
+            writer.write("control_effort", JOINT_STATE, answer)
+    (report,) = analyze([tmp_path / "realtime"]).episodes
+    (response,) = report.responses[0]
+    assert (response.kind, report.episode.name) == ("disturbance", "disturbance")
+    assert response.metrics.peak == run.output.max()

@@ -60,7 +60,7 @@ def random_record(seed: int, noise: float, kind: str | None = None, samples: int
         zero = 0.0
         if kind == "zero":
             structure = STRUCTURES["second_order_zero"]
-            zero = t * (rng.uniform(2.0, 4.0) if rng.random() < 0.5 else -rng.uniform(0.7, 2.0))
+            zero = t * (rng.uniform(3.2, 5.0) if rng.random() < 0.5 else -rng.uniform(0.7, 2.0))  # cancels no lag
             numerator = np.array([gain, gain * zero / t])
         if damping < 1.0:
             rule = imc_oscillating(gain, t, damping, dead_time, sample_period=period)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from random_records import RandomRecord, random_record
 
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.identification.identify import Identified, identify
@@ -114,6 +115,31 @@ def test_several_stretches_share_one_plant() -> None:
     assert found.structure.name == "first_order"
     for name, true in record.parameters.items():
         assert found.values[name] == pytest.approx(true, rel=0.1)
+
+
+def test_what_was_before_a_record_is_not_guessed() -> None:
+    """A record that begins in the midst of a loop's moves: what the effort was before, is not known."""
+    for seed in (708, 710):
+        record = random_record(seed, 0.02, samples=3000)
+        first = int(np.random.default_rng(seed).uniform(200, 1500))
+        effort, output = record.effort[first:], record.output[first:]
+        time = record.period * np.arange(len(output))
+        found = identify([Stretch(time, effort, output, False, float(effort[0]), True)])
+        assert right(record, found)
+        for name, true in record.parameters.items():
+            assert found.values[name] == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["p1-c0.5", "p1-c4", "p2-c2", "p2-c5", "p3-c1", "p3-c2"])
+def test_the_paper_s_processes_from_one_step_of_the_setpoint(name: str) -> None:
+    case = load_case(name)
+    run = case.simulate("setpoint")
+    effort, output = run.control_effort[:, 0], run.output[:, 0]
+    found = identify([Stretch(run.time, effort, output, True, 0.0, True)])
+    model, values = found.structure.catalogued(found.values) or ("", {})
+    assert model == case.model
+    for parameter, value in values.items():
+        assert value == pytest.approx(case.plant_values[parameter], rel=0.01, abs=1e-6)
 
 
 def test_a_long_record_is_fitted_as_a_whole() -> None:

@@ -422,3 +422,7 @@ def test_the_program_says_and_writes_what_is_claimed(capsys: pytest.CaptureFixtu
 def test_numbers_that_are_infinite_are_null_in_json() -> None:
     loop = Loop(TransferFunction((1.0,), (1.0, 1.0)), Gains("npid", 0.0, 0.5), 0.01)
     json.dumps(certify(case_of(loop), loop.gains).as_dict(), allow_nan=False)
+    far = load_case("p1-c4")
+    creep = certify(far, far.gains.with_values(sigma=0.001)).creep
+    assert creep is not None and creep.step_s is None  # a step of 1,000 sigma: beyond all numbers
+    json.dumps(certify(far, far.gains.with_values(sigma=0.001)).as_dict(), allow_nan=False)
