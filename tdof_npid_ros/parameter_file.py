@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,35 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     own: dict[str, Any] = {}
     _collect(document, node, path, shared, own)
     return shared | own
+
+
+def sections_of(path: Path) -> list[str]:
+    """The nodes that a parameter file is for, as it writes them: `/**/controller`, `/left/plant`, `/**`.
+
+    Raises:
+        ParameterFileError: it cannot be read.
+    """
+
+    def found(tree: dict[str, Any], above: str) -> Iterator[str]:
+        for key, value in tree.items():
+            name = f"{above}/{str(key).strip('/')}"
+            if isinstance(value, dict) and "ros__parameters" in value:
+                yield name
+            elif isinstance(value, dict):
+                yield from found(value, name)
+
+    return list(found(_load(path), ""))
+
+
+def is_for(section: str, node: str) -> bool:
+    """Whether ROS gives a section's parameters to a node.
+
+    Args:
+        section: `/**/controller`, with `*` for one name and `**` for any number of them.
+        node: its full name.
+    """
+    pattern = re.escape("/" + section.strip("/")).replace(r"/\*\*", "(/[^/]+)*").replace(r"/\*", "/[^/]+")
+    return re.fullmatch(pattern, node) is not None
 
 
 def find_parameter_file(name: str | Path) -> Path:

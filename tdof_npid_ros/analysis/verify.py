@@ -93,6 +93,7 @@ class _Replay:
         self._topic = loop.effort_topic
         self._configurations = configurations(loop.histories)
         self._session: Session | None = None
+        self._passed_over: Place | None = None  # the latest answer that could not be computed again
         self._known = False  # whether the controller's state is that of the recorded one
 
     def run(self) -> None:
@@ -122,6 +123,7 @@ class _Replay:
         if reason is not None:
             self._known = False
             self._account.unverifiable[reason] += 1
+            self._passed_over = place
             if self._session is not None:
                 self._session.pass_over(place)
             return
@@ -169,6 +171,8 @@ class _Replay:
         session = self._session
         if session is None:
             session = self._session = Session(Controller(gains, period_ns, options), Joints(()))
+            if self._passed_over is not None:  # the loop had begun before: this answer is no start
+                session.pass_over(self._passed_over)
         elif session.controller.sample_period_ns != period_ns:
             session.controller = Controller(gains, period_ns, options)
         elif (session.controller.gains, session.controller.options) != (gains, options):

@@ -124,10 +124,14 @@ def gains_from_candidates(base: Gains, names: Sequence[str], candidates: np.ndar
 def gains_from_mapping(values: Mapping[str, Any]) -> Gains:
     """Gains from parameters by name; other parameters in `values` are passed over.
 
+    Gains that are all single numbers serve every joint of `joint_names`, where that is among the values.
+
     Raises:
         GainsError: a value has the wrong type or range.
     """
-    return Gains(**{name: values[name] for name in GAIN_NAMES if name in values})
+    gains = Gains(**{name: values[name] for name in GAIN_NAMES if name in values})
+    joints = sum(1 for name in values.get("joint_names") or () if name)
+    return gains.with_values(kp=(gains.kp,) * joints) if gains.lanes == 1 < joints else gains
 
 
 def controller_type(value: object) -> ControllerType:

@@ -12,13 +12,16 @@ import numpy as np
 
 from tdof_npid_ros.control.controller import Controller, rest_setpoint
 from tdof_npid_ros.control.gains import LARGEST_SIGNAL
-from tdof_npid_ros.control.joints import Joints, fault_of
+from tdof_npid_ros.control.joints import Joints, fault_of, name_joints
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import NO_VALUES, AnswerLabel, EpisodeLabel, Sample
 
 FAR_NS = 1_000_000_000  # a stamp that far back, or ahead of the time that has passed, is another clock's
 IN_A_ROW = 3  # outputs that do not belong to the loop, but follow each other: the loop has changed over to them
 FAR_IN_SIGMA = 3.0  # k(3 sigma) = 0.011: beyond it the integral action is as good as dead
+RATE_WINDOW = 50  # outputs over which their rate is measured
+RATE_TOLERANCE = 0.2  # of the sample period
+STUCK_OUTPUTS = 10  # with one stamp
 REMEMBERED = 100  # activations of plants whose labels are known to be no new ones
 
 Decision = Literal[
@@ -41,6 +44,8 @@ FAR_AHEAD = "output refused: its stamp is far ahead of the one before"
 OTHER_EPISODE = "output refused: it is of an episode that another has followed"
 IF_MORE_FOLLOW = f"; {IN_A_ROW} such in a row are taken"
 OUT_OF_STEP = "plant and controller differ in sample_period: give both the same"
+OFF_RATE = "outputs come at another rate than sample_period: set that to the time between two outputs"
+STUCK = "outputs come, but with the same stamp again and again: stamp each message"
 
 
 class Place(NamedTuple):
@@ -235,7 +240,7 @@ class Session:
         waiting: an output whose plan has not come.
         silent: no output comes; the next one is joined.
         is_live: the loop goes on without waiting for answers: in realtime, and on a robot.
-        is_out_of_step: the plant in lockstep has another sample period.
+        is_out_of_step: the time between outputs is not the sample period.
     """
 
     def __init__(self, controller: Controller, joints: Joints) -> None:
@@ -259,6 +264,8 @@ class Session:
         self._answered = NO_VALUES  # the latest output that was
         self._arrival_ns: int | None = None
         self._common = np.zeros(self.controller.lanes)
+        self._repeats = 0  # outputs since the latest one with a stamp of its own
+        self._measured_from_ns, self._intervals, self._off = 0, 0, 0
 
     @property
     def label(self) -> EpisodeLabel | None:
@@ -271,8 +278,24 @@ class Session:
         return self.sequence.latest and self.sequence.latest.stamp_ns
 
     def set_setpoint(self, setpoint: np.ndarray) -> None:
-        """Take this setpoint, (1,) or (lanes,), for outputs without a plan."""
-        self.setpoint, self.holds_output = setpoint, False
+        """Take this setpoint, (1,) or (lanes,), for outputs without a plan.
+
+        Lanes that wait for the first output as their setpoint have nan.
+        """
+        self.setpoint = setpoint
+        self.holds_output = self.holds_output and bool(np.isnan(setpoint).any())
+
+    @property
+    def lanes_setpoint(self) -> np.ndarray:
+        """The live setpoint, (lanes,); nan where it will be the first output."""
+        if self.holds_output and not np.isnan(self.setpoint).any():
+            return np.full(self.controller.lanes, np.nan)
+        return self._live_setpoint()
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether a robot's outputs come, but all with one stamp."""
+        return self.is_live and self.label is None and self._repeats >= STUCK_OUTPUTS
 
     @property
     def is_setpoint_far(self) -> bool:
@@ -295,7 +318,10 @@ class Session:
         except ValueError as error:
             return Outcome("refused", None, "output refused", f": it {error}")
         if (fault := fault_of("output", y, self.controller.lanes, LARGEST_SIGNAL)) is not None:
-            return Outcome("refused", None, *fault)
+            why, detail = fault
+            if len(y) > self.controller.lanes and not self.joints.names:
+                detail += name_joints(output.name)
+            return Outcome("refused", None, why, detail)
         place = Place(EpisodeLabel.parse(output.frame_id), output.stamp_ns)
         self.waiting = None
         setpoint = self._setpoint_at(place)
@@ -306,17 +332,22 @@ class Session:
         silent = self.is_live and 0 < self.timeout_ns < elapsed_ns
         decision, why, detail = self.sequence.judge(place, silent, elapsed_ns)
         if decision == "same":
+            self._repeats += 1
             if place.label is None and y.tobytes() != self._answered.tobytes():
                 return Outcome("refused", None, NOT_STAMPED_ANEW, STAMP_IT)
             return Outcome("same", self.answer)
         if decision in ("late", "refused"):
             return Outcome(decision, None, why, detail)
-        if decision == "new" and place.label is not None and place.label.plan:
-            why, detail = self._compare_periods(place)
-        if self.holds_output and not (place.label and place.label.plan):
-            self.set_setpoint(y)
+        follows_plan = place.label is not None and bool(place.label.plan)
+        if decision != "new":
+            self._measure_from(place)
+        else:
+            why, detail = self._compare_periods(place) if follows_plan else self._measure_rate(place)
+        if self.holds_output and not follows_plan:
+            held = self.lanes_setpoint
+            self.set_setpoint(np.where(np.isnan(held), y, held))
             setpoint = self._live_setpoint()
-        self._answered, self._arrival_ns, self.silent = y, now_ns, False
+        self._answered, self._arrival_ns, self.silent, self._repeats = y, now_ns, False, 0
         applied = self._applied(output) if decision in ("join", "start") else None
         self._proceed(decision, place, setpoint, y, applied, self._take_saved(decision))
         return Outcome(decision, self.answer, why, detail, silent)
@@ -329,6 +360,27 @@ class Session:
         return (
             (OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s") if self.is_out_of_step else _FINE
         )
+
+    def _measure_from(self, place: Place) -> None:
+        self._measured_from_ns, self._intervals, self._off = place.stamp_ns, 0, 0
+
+    def _measure_rate(self, place: Place) -> tuple[str, str]:
+        """Outputs that nobody waits for come every sample period, too, on the whole; if not, it was set wrong.
+
+        Most intervals must be off, and so must their mean: neither gaps nor jitter are another rate.
+        """
+        assert self.stamp_ns is not None
+        period_ns = self.controller.sample_period_ns
+        self._intervals += 1
+        self._off += abs(place.stamp_ns - self.stamp_ns - period_ns) > RATE_TOLERANCE * period_ns
+        if self._intervals < RATE_WINDOW:
+            return _FINE
+        mean_ns = (place.stamp_ns - self._measured_from_ns) / RATE_WINDOW
+        self.is_out_of_step = self._off > RATE_WINDOW / 2 and abs(mean_ns - period_ns) > RATE_TOLERANCE * period_ns
+        self._measure_from(place)
+        if not self.is_out_of_step:
+            return _FINE
+        return OFF_RATE, f": it is {mean_ns / 1e9:.4g} s, and sample_period is {period_ns / 1e9:g} s"
 
     def look_for_silence(self, now_ns: int) -> bool:
         """Whether the loop in realtime has just fallen silent."""

@@ -18,16 +18,17 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import Gains, gains_from_mapping
-from tdof_npid_ros.control.joints import Joints
+from tdof_npid_ros.control.gains import TUNED, Gains, Lanes, gains_from_mapping
+from tdof_npid_ros.control.joints import SHOWN_NAMES, Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
-from tdof_npid_ros.control.session import FAR_IN_SIGMA, OUT_OF_STEP, Answer, Outcome, Session
+from tdof_npid_ros.control.session import FAR_IN_SIGMA, OFF_RATE, OUT_OF_STEP, STUCK, Answer, Outcome, Session
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS, signal_qos
 from tdof_npid_ros.graph.runtime.run import run_node
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import CONTROLLER, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
 from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
 
@@ -49,11 +50,6 @@ class ControllerNode(LoopEnd):
         )
         self.controller.warm_up()
         self.joints = Joints(given["joint_names"])
-        if self.joints.names and len(self.joints.names) != self.controller.lanes:
-            raise ValueError(
-                f"joint_names has {len(self.joints.names)} names, but the gains are for {self.controller.lanes} lanes: "
-                "give kp one value per joint"
-            )
         self.session = Session(self.controller, self.joints)
         self.checked(given)
         self.changed({name: given[name] for name in ("setpoint", "output_timeout")})
@@ -63,6 +59,7 @@ class ControllerNode(LoopEnd):
         """Create topics, services and timers."""
         self.prepare_for_realtime()
         self.session.begin()
+        self.why_refused = ""  # the latest output, if that was
         self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
         self.effort = SignalWriter()
         self.effort_label: AnswerLabel | None = None
@@ -97,23 +94,30 @@ class ControllerNode(LoopEnd):
             self._on_output(self.session.waiting)
 
     def _on_setpoint(self, sample: Sample) -> None:
-        r = self._picked("setpoint", sample.name, sample.position)
-        if r is None:
+        if not len(sample.position) and len(sample.effort):
+            self.refuse("rejected", "setpoint refused: it came in effort, publish it in position")
             return
-        if len(r) not in (1, self.controller.lanes) or not (np.abs(r) <= LARGEST_SIGNAL).all():
-            self.refuse("rejected", "setpoint refused: it must be finite, one value or one per lane")
-        else:
-            self.session.set_setpoint(r)
-            if self.session.is_setpoint_far:
-                self.warn_once(
-                    f"the setpoint is more than {FAR_IN_SIGMA:g} sigma from the output (sigma is "
-                    f"{self.controller.gains.sigma}): such an error is hardly integrated, the output may stop short; "
-                    "set sigma to the largest change of the setpoint"
-                )
+        try:
+            r = self.joints.merged(sample.name, sample.position, self.session.lanes_setpoint, LARGEST_SIGNAL)
+        except ValueError as error:
+            self.refuse("rejected", "setpoint refused", f": it {error}")
+            return
+        self.session.set_setpoint(r)
+        if self.session.is_setpoint_far:
+            self.warn_once(
+                f"the setpoint is more than {FAR_IN_SIGMA:g} sigma from the output (sigma is "
+                f"{self.controller.gains.sigma}): such an error is hardly integrated, the output may stop short; "
+                "set sigma to the largest change of the setpoint"
+            )
 
     def _on_manual_effort(self, sample: Sample) -> None:
-        values = self._picked("manual_effort", sample.name, sample.effort)
-        if values is None:
+        if not len(sample.effort) and len(sample.position):
+            self.refuse("rejected", "manual_effort refused: it came in position, publish it in effort")
+            return
+        try:
+            values = self.joints.selected(sample.name, sample.effort)
+        except ValueError as error:
+            self.refuse("rejected", "manual_effort refused", f": it {error}")
             return
         effort = values.tolist()
         parameter = Parameter("manual_effort", value=effort if len(effort) > 1 else effort[0] if effort else math.nan)
@@ -140,12 +144,15 @@ class ControllerNode(LoopEnd):
         if after_silence:
             self.get_logger().info("output comes again: going on")
         if why:
+            if answer is None:
+                self.why_refused = why + detail
             self.refuse("rejected" if answer is None else "out_of_step", why, detail)
         if decision == "late":
             self.counts["late"] += 1
         elif decision == "same":
             self.counts["repeated"] += 1
         elif answer is not None:
+            self.why_refused = ""
             self.counts["steps"] += 1
             if self.controller.saturated:
                 self.counts["saturated"] += 1
@@ -158,20 +165,11 @@ class ControllerNode(LoopEnd):
         if status.current_count_change > 0 and session.answer is not None and not session.is_live:
             self.effort_publisher.publish(self._message(session.answer))
 
-    def _picked(self, topic: str, names: Sequence[str], values: np.ndarray) -> np.ndarray | None:
-        """A signal's values for the lanes; None if it is refused."""
-        try:
-            return self.joints.selected(names, values)
-        except ValueError as error:
-            self.refuse("rejected", f"{topic} refused", f": it {error}")
-            return None
-
     def _look_for_silence(self) -> None:
         if self.session.look_for_silence(time.monotonic_ns()):
             self.counts["silences"] += 1
-            self.get_logger().error(
-                f"no output for {self.session.timeout_ns / 1e9:g} s: the integral action waits. Look after the plant"
-            )
+            silence = f"no output for {self.session.timeout_ns / 1e9:g} s: the integral action waits. "
+            self.get_logger().error(STUCK if self.session.is_stuck else f"{silence}Look after the plant")
 
     # What goes out
 
@@ -184,6 +182,15 @@ class ControllerNode(LoopEnd):
         self.state_publisher.publish(self.terms.write(stamp, position=self.controller.terms))
 
     # Parameters and state
+
+    def summary(self) -> str:
+        """The law, its gains and its rate; and what it waits for."""
+        gains = self.controller.gains
+        numbers = ", ".join(f"{name} {_short(getattr(gains, name))}" for name in (*TUNED[gains.type], "sigma"))
+        joints = f" for {', '.join(self.joints.names[:SHOWN_NAMES])}" if self.joints.names else ""
+        rate = 1e9 / self.controller.sample_period_ns
+        output = self.resolve_topic_name("output")
+        return f"{gains.type}{joints}, {numbers}, {rate:g} Hz, waiting for {output}"
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
@@ -209,12 +216,14 @@ class ControllerNode(LoopEnd):
 
     def _configured(self, changes: dict[str, Any]) -> tuple[Gains, ControllerOptions]:
         """Gains and options with some parameters changed; ValueError if they are not valid."""
-        now = {**self.controller.gains.as_dict(), **self.controller.options.as_dict(), **changes}
+        # Out of the parameters as they are set, as `verify` finds them in a bag.
+        now = {**self.values_of([*GAINS, *OPTIONS, "joint_names"]), **changes}
         gains, options = gains_from_mapping(now), options_from_mapping(now)
         options.check_lanes(gains)
         if self.joints.names and gains.lanes != len(self.joints.names):
             raise ValueError(
-                f"the gains are for {gains.lanes} lanes, but there are {len(self.joints.names)} joint_names"
+                f"the gains are for {gains.lanes} lanes, but joint_names has {len(self.joints.names)} names: give one "
+                "value, or one per joint"
             )
         if gains.lanes != self.controller.lanes and self._answers_live_outputs:
             raise ValueError(
@@ -238,16 +247,29 @@ class ControllerNode(LoopEnd):
         session = self.session
         if session.waiting is not None:
             return WARN, "an output waits for its plan on scenario_plan: start the scenario", facts
+        if session.stamp_ns is None and self.why_refused:
+            return ERROR, one_line(self.why_refused), facts
         if session.stamp_ns is None:
             return WARN, "no output yet: start the plant, or remap output to your robot's joint_states", facts
         facts["time_s"] = session.stamp_ns / 1e9
+        if session.is_stuck:
+            return ERROR, STUCK, facts
         if session.silent:
-            return ERROR, "output has stopped: look after the plant; the effort is as it was", facts
+            stopped = "output has stopped: look after the plant; the effort is as it was"
+            return ERROR, one_line(self.why_refused) or stopped, facts
         if session.is_out_of_step:
-            return ERROR, OUT_OF_STEP, facts
+            return ERROR, OFF_RATE if session.is_live else OUT_OF_STEP, facts
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts
+
+
+def _short(gain: Lanes) -> str:
+    """A gain for the log: the number, or the first ones of the lanes."""
+    if not isinstance(gain, tuple):
+        return f"{gain:g}"
+    shown = " ".join(f"{one:g}" for one in gain[:SHOWN_NAMES])
+    return f"[{shown}]" if len(gain) <= SHOWN_NAMES else f"[{shown} …]"
 
 
 def _check_sigma(type_: str, hint: str) -> None:

@@ -14,7 +14,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.graph.plant.port import EPISODE
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
-from tdof_npid_ros.graph.runtime.node import OK, STEADY, LoopNode
+from tdof_npid_ros.graph.runtime.node import OK, STEADY, WARN, LoopNode
 from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.run import run_node
@@ -266,11 +266,17 @@ class ScenarioNode(LoopNode):
         """Take over accepted changes."""
         self._read_plans(changes)
 
+    def summary(self) -> str:
+        """What it plays."""
+        return f"{'playing' if self.play_at_start else 'scenario/play plays'} {', '.join(self.plans)}, in {self.mode}"
+
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""
         facts: dict[str, object] = {"state": "playing" if self.current else "idle", "played": self.played}
         if self.current:
             facts["plan"] = self.current.digest
+            if self.mode == "lockstep" and self.label is None:
+                return WARN, "no plant is heard: start the plant in this namespace, with mode lockstep", facts
         return OK, str(facts["state"]), facts
 
 

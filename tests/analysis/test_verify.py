@@ -169,6 +169,22 @@ def test_a_controller_that_begins_within_a_running_loop_tells_its_integral_actio
     assert verify.verify(tmp_path / "bag").equal == 300
 
 
+def test_a_robot_s_loop_whose_first_outputs_are_not_in_the_bag_is_not_verifiable_and_not_different(
+    tmp_path, case
+) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        controller = Controller(case.gains, case.sample_period_ns)
+        for k in range(50):
+            stamp, y = 10**18 + k * case.sample_period_ns, np.array([np.sin(k / 30)])
+            controller.answer(stamp, np.ones(1), y)
+            if k >= 5:
+                bag.write("output", JOINT_STATE, joint_state(stamp, "base_link", y))
+            bag.write("control_effort", JOINT_STATE, joint_state(stamp, controller.digest, [1.0], controller.effort))
+    account = verify.verify(tmp_path / "bag")
+    assert (account.equal, account.different, account.unverifiable[UNKNOWN_STATE]) == (0, 0, 45)
+
+
 def test_a_realtime_loop_recorded_before_outputs_bore_labels_began_from_nothing_at_each_stamp_of_0(
     tmp_path, case
 ) -> None:

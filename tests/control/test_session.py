@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.controller import Controller
-from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.control.gains import Gains, gains_from_mapping
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions
 from tdof_npid_ros.control.session import (
     FAR_AHEAD,
     NOT_STAMPED_ANEW,
+    OFF_RATE,
     OTHER_EPISODE,
     OUT_OF_STEP,
     UNLABELLED,
@@ -138,7 +140,11 @@ def test_an_unstamped_message_at_a_steady_loop_changes_nothing_and_is_told() -> 
         ([math.nan], "output that is not finite refused", ""),
         ([math.inf], "output that is not finite refused", ""),
         ([], "output refused", ": it has 0 values for 1 lanes"),
-        ([1.0, 2.0], "output refused", ": it has 2 values for 1 lanes"),
+        (
+            [1.0, 2.0],
+            "output refused",
+            ": it has 2 values for 1 lanes; name the joints to control in joint_names, or give kp one value each",
+        ),
     ],
 )
 def test_what_is_no_output_is_refused_with_the_reason(position: list[float], why: str, detail: str) -> None:
@@ -211,6 +217,104 @@ def test_plant_and_controller_with_different_periods_are_told() -> None:
     outcome = one.take(output(f"{plan.digest}/a.1", 5 * MS), 0)
     assert (outcome.decision, outcome.why, one.is_out_of_step) == ("new", OUT_OF_STEP, True)
     assert outcome.answer is not None and outcome.detail == ": it is 0.005 s and 0.01 s"
+
+
+def robot(periods_ns: Sequence[int]) -> Iterator[Sample]:
+    """Outputs that lie so far apart."""
+    stamp = 10**18
+    for k, period_ns in enumerate(periods_ns):
+        stamp += period_ns
+        yield output(ROBOT, stamp, 0.5 + k % 2)
+
+
+@pytest.mark.parametrize(
+    ("periods_ns", "told"),
+    [
+        ([PERIOD_NS] * 300, ""),
+        ([2 * PERIOD_NS] * 60, OFF_RATE),
+        ([PERIOD_NS // 2] * 60, OFF_RATE),
+        ([PERIOD_NS + PERIOD_NS // 10] * 300, ""),  # 10 per cent
+        ([PERIOD_NS // 2, PERIOD_NS * 3 // 2] * 150, ""),  # jitter
+        ([PERIOD_NS] * 20 + [40 * PERIOD_NS] + [PERIOD_NS] * 40, ""),  # a gap
+    ],
+)
+def test_a_rate_that_is_not_sample_period_s_is_told(periods_ns: list[int], told: str) -> None:
+    one = session()
+    outcomes = [one.take(sample, k * PERIOD_NS) for k, sample in enumerate(robot(periods_ns))]
+    assert all(outcome.answer is not None for outcome in outcomes)
+    assert {outcome.why for outcome in outcomes} == {"", told}
+    assert one.is_out_of_step == bool(told)
+
+
+def test_a_rate_that_is_told_and_then_mended_is_right_again() -> None:
+    one = session()
+    for k, sample in enumerate(robot([2 * PERIOD_NS] * 60 + [PERIOD_NS] * 100)):
+        one.take(sample, k * PERIOD_NS)
+    assert not one.is_out_of_step
+
+
+def test_a_robot_that_never_stamps_is_stuck_whether_it_moves_or_not() -> None:
+    for moves in (0.0, 0.1):
+        one = session()
+        for k in range(20):
+            one.take(output(ROBOT, 0, moves * k), k * PERIOD_NS)
+        assert one.is_stuck
+        one.take(output(ROBOT, PERIOD_NS, 0.5), 20 * PERIOD_NS)
+        assert not one.is_stuck
+
+
+# Joints
+
+
+def test_single_gains_serve_every_joint() -> None:
+    names = ["elbow", "wrist", "hand"]
+    one = gains_from_mapping({"kp": 2.0, "ki": 1.0, "joint_names": names})
+    assert one.lanes == 3 and one.per_lane("kp").tolist() == [2.0] * 3
+    assert gains_from_mapping({"kp": 2.0, "joint_names": [""]}) == gains_from_mapping({"kp": 2.0})
+    assert gains_from_mapping({"kp": 2.0, "joint_names": ["elbow"]}) == gains_from_mapping({"kp": 2.0})
+    some = {"kp": 2.0, "effort_max": [1.0, 2.0, 3.0], "joint_names": names}
+    assert gains_from_mapping(some).kp == 2.0  # as in recordings of before: their digests stay
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("names", "values", "merged"),
+    [
+        ((), [5.0], [5.0]),
+        ((), [5.0, 6.0, 7.0], [5.0, 6.0, 7.0]),
+        ((), [NAN, 6.0, NAN], [1.0, 6.0, 3.0]),
+        (("wrist",), [6.0], [1.0, 6.0, 3.0]),
+        (("hand", "base", "elbow"), [7.0, 9.0, 5.0], [5.0, 2.0, 7.0]),
+        (("hand", "elbow"), [NAN, 5.0], [5.0, 2.0, 3.0]),
+        ((), [5.0, 6.0], "2 values for 3 lanes"),
+        ((), [NAN], "not finite"),
+        ((), [math.inf, NAN, 1.0], "beyond"),
+        (("base",), [1.0], "no joint of elbow, wrist, hand: it has base"),
+        (("elbow", "wrist"), [1.0], "1 values for 2 names"),
+    ],
+)
+def test_a_setpoint_for_some_of_the_joints_leaves_the_others(
+    names: tuple[str, ...], values: list[float], merged: list[float] | str
+) -> None:
+    joints, before = Joints(["elbow", "wrist", "hand"]), np.array([1.0, 2.0, 3.0])
+    if isinstance(merged, str):
+        with pytest.raises(ValueError, match=merged):
+            joints.merged(names, np.array(values), before, 1e100)
+    else:
+        assert joints.merged(names, np.array(values), before, 1e100).tolist() == merged
+
+
+def test_joints_without_a_setpoint_are_held_when_the_first_one_is_for_others() -> None:
+    joints = Joints(["elbow", "wrist"])
+    one = Session(Controller(gains_from_mapping({**GAINS.as_dict(), "joint_names": joints.names}), PERIOD_NS), joints)
+    one.holds_output = True
+    one.set_setpoint(joints.merged(("wrist",), np.array([0.75]), one.lanes_setpoint, 1e100))
+    y = np.array([0.25, 0.5])
+    answer = one.take(Sample(10**18, ROBOT, ("elbow", "wrist"), y, NO_VALUES, NO_VALUES), 0).answer
+    assert answer is not None and answer.setpoint.tolist() == [0.25, 0.75]
+    assert not one.holds_output
 
 
 def test_an_output_waits_for_its_plan() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tdof_npid_ros.analysis.verify import verify
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 
 PLANT = {"mode": "realtime", "model": "first_order", "time_constant": 0.5, "dead_time": 0.0, "sample_period": 0.01}
@@ -269,6 +271,68 @@ def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
     )
     incomplete = JointState(name=["base", "elbow"], position=[0.0, 0.0])
     graph.publish_until(joint_states, incomplete, lambda: "has no joint wrist" in controller.log, what="a refusal")
+
+
+def test_one_value_of_a_gain_serves_all_joints_and_a_setpoint_may_be_for_some(graph: Any, tmp_path: Path) -> None:
+    """And all of it is verified, also after the gain of one joint was changed."""
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start("controller", kp=2.0, ki=0.5, type="pid", setpoint=1.0,
+                             joint_names=["elbow", "wrist", "hand"])  # fmt: skip
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    graph.wait_for_nodes("/controller", "/recorder")
+    output = graph.publisher("output", JointState)
+    message = JointState(name=["base", "hand", "wrist", "elbow"], position=[9.0, 0.75, 0.5, 0.25])
+    message.header.frame_id = "base_link"
+
+    def answer() -> Any:
+        message.header.stamp.sec += 1
+        stamp = message.header.stamp
+        graph.publish_until(output, message, lambda: efforts and efforts[-1].header.stamp == stamp, what="an answer")
+        return efforts[-1]
+
+    assert list(answer().effort) == [1.5, 1.0, 0.5]
+    setpoint = graph.publisher("setpoint", JointState)
+    wrist = JointState(name=["wrist"], position=[3.0])
+    graph.publish_until(setpoint, wrist, lambda: list(answer().position) == [1.0, 3.0, 1.0], what="the wrist's")
+    some = JointState(position=[4.0, math.nan, math.nan])
+    graph.publish_until(setpoint, some, lambda: list(answer().position) == [4.0, 3.0, 1.0], what="the elbow's")
+    in_effort = JointState(effort=[1.0])
+    graph.publish_until(setpoint, in_effort, lambda: "it came in effort" in controller.log, what="a refusal")
+    assert graph.set_parameters("/controller", ki=[0.0, 0.5, 1.0])[0].successful
+    answer()
+    assert graph.set_parameters("/controller", kp=5.0)[0].successful
+    answer()
+    assert "ready: pid for elbow, wrist, hand, kp [2 2 2], ki 0.5, kd 0" in controller.log
+    recorder.stop()
+    account = verify(tmp_path / "bag")
+    assert account.different == 0 and account.equal >= 5, account
+
+
+def test_a_message_with_more_joints_than_lanes_is_refused_with_what_to_do(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
+    controller = graph.start("controller", "-r", "output:=joint_states")
+    joint_states = graph.publisher("joint_states", JointState)
+    graph.publish_until(
+        joint_states,
+        JointState(name=["elbow", "wrist"], position=[1.0, 2.0]),
+        lambda: "name the joints to control in joint_names, of elbow, wrist" in graph.fact("/controller", "message"),
+        what="an error that names joint_names",
+    )
+    assert "joint_names" in controller.log and graph.fact("/controller", "level") == 2
+
+
+def test_a_node_tells_that_it_is_ready_what_it_waits_for_and_of_parameters_for_another_name(graph: Any) -> None:
+    file = graph.folder / "arm.yaml"
+    file.write_text("/**/controller: {ros__parameters: {kp: 7.0, sigma: 1.0}}\n")
+    given = ("-r", "__node:=arm", "--params-file", str(file), "-p", "controller:kp:=3.0", "-p", "type:=pid")
+    controller = graph.start("controller", *given, type="pid")
+    graph.wait_for_log(controller, "ready: pid, kp 1, ki 0, kd 0, sigma 1, 100 Hz, waiting for /output")
+    assert f"{file} gives this node, /arm, nothing: it is for /**/controller; write /**/arm instead" in controller.log
+    assert "controller:kp:=3.0 gives this node, /arm, nothing" in controller.log
+    graph.wait_for_log(controller, "no output yet: start the plant, or remap output to your robot's joint_states (so ")
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])

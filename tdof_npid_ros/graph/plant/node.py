@@ -76,6 +76,15 @@ class PlantNode(LoopEnd):
         """Take over accepted changes."""
         self.way_of_running.changed()
 
+    def summary(self) -> str:
+        """The model, the way of running, and what it waits for."""
+        lanes = self.port.simulator.lanes
+        waits = "scenario_plan" if self.mode == "lockstep" else "control_effort"
+        return (
+            f"{self.model}, {lanes} lane{'s' if lanes > 1 else ''}, {self.mode} at {1e9 / self.port.period_ns:g} Hz, "
+            f"waiting for {self.resolve_topic_name(waits)}"
+        )
+
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""
         level, text, facts = self.way_of_running.state()

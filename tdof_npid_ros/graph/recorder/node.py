@@ -104,7 +104,6 @@ class RecorderNode(LoopNode):
             self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
         self.thread = TapThread(self._take, self._write)
         self.discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=STEADY)
-        self.get_logger().info(f"recording to {self.folder}")
         self._look()
 
     def deactivate(self) -> None:
@@ -305,6 +304,10 @@ class RecorderNode(LoopNode):
     def lost(self) -> int:
         """Messages lost so far."""
         return self._losses().total()
+
+    def summary(self) -> str:
+        """Where it records to."""
+        return f"recording to {self.folder}"
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         """What is recorded where, and what went wrong."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 import functools
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -27,10 +30,13 @@ from tdof_npid_ros.graph.runtime.realtime import collect_garbage
 from tdof_npid_ros.graph.runtime.unread import take_unread
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameter import Parameter, Table, infinity_as_float
+from tdof_npid_ros.parameter_file import ParameterFileError, is_for, sections_of
 from tdof_npid_ros.parameters import AUTOSTART, misspelt
 from tdof_npid_ros.wire import Sample, SignalReader
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+WAIT_UNTIL_TOLD = 5.0  # s
+SHOWN_VALUES = 8  # of an array, in a log
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 OK, WARN, ERROR = (level[0] for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
@@ -59,6 +65,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.endpoints = Endpoints(self, self.refuse)
         guard_services(self.services, self.refuse)
         self._warned: set[str] = set()
+        self._waits_for, self._waits_since_ns = "", 0
+        for warning in for_another_name(sys.argv, name, self.get_fully_qualified_name()):
+            self.get_logger().warning(one_line(warning))
         self.autostart = bool(self.declare(AUTOSTART))
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(DIAGNOSTICS_PERIOD, self._on_diagnostics_timer, clock=STEADY)
@@ -87,6 +96,10 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def state(self) -> tuple[int, str, dict[str, object]]:
         """Level, one line for an operator, and facts, for the diagnostics."""
         return OK, "", {}
+
+    def summary(self) -> str:
+        """What the node will do, in a few words, for the line in its log that says that it is ready."""
+        return ""
 
     def destroy_node(self) -> None:
         """As `Node.destroy_node`, and leave the DDS domain.
@@ -303,8 +316,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def _on_parameters_set(self, parameters: list[RosParameter]) -> None:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}
         for name, value in changes.items():
-            if name not in self.quiet_parameters:
-                self.get_logger().info(one_line(f"{name}: {self._before.get(name)} -> {value}"))
+            before = self._before.get(name)
+            if name not in self.quiet_parameters and value != before:
+                self.get_logger().info(one_line(f"{name}: {shortened(before)} -> {shortened(value)}"))
         self.changed({name: self._taken(name, value) for name, value in changes.items()})
 
     # Reporting
@@ -327,11 +341,20 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def publish_diagnostics(self) -> None:
         """Publish the node's state and counts now; it happens once a second anyway."""
         level, text, facts = self.state() if self.active else (WARN, self._why_inactive, {})
+        self._tell_of_waiting(text if self.active and level == WARN else "")
         if self.endpoints.conflicts:
             level, text = max(level, WARN), "; ".join([text, *self.endpoints.conflicts])
         stamp = self.get_clock().now().to_msg()
         name = self.get_fully_qualified_name()
         self._diagnostics_publisher.publish(diagnostics_message(stamp, name, level, text, {**facts, **self.counts}))
+
+    def _tell_of_waiting(self, text: str) -> None:
+        """Log once what the node has been waiting for for some seconds, or what is not as it should be."""
+        now = STEADY.now().nanoseconds
+        if text != self._waits_for:
+            self._waits_for, self._waits_since_ns = text, now
+        elif text and now - self._waits_since_ns >= WAIT_UNTIL_TOLD * 1e9:
+            self.warn_once(f"{text} (so for {WAIT_UNTIL_TOLD:g} s)")
 
     def _on_diagnostics_timer(self) -> None:
         if self.uses_events_executor:
@@ -357,6 +380,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         finally:
             self._activating = False
         self.active = True
+        self.get_logger().info(one_line(f"ready: {self.summary() or self.state()[1]}"))
         self.publish_diagnostics()
         return super().on_activate(state)
 
@@ -407,6 +431,43 @@ def _do_nothing() -> None:
 def plain(value: Any) -> Any:
     """A parameter's value with arrays as lists."""
     return list(value) if hasattr(value, "__len__") and not isinstance(value, (str, bytes)) else value
+
+
+def shortened(value: Any) -> str:
+    """A parameter's value for the log: of a long array its beginning."""
+    if not isinstance(value, list) or len(value) <= SHOWN_VALUES:
+        return str(value)
+    return f"[{', '.join(map(repr, value[:SHOWN_VALUES]))}, … {len(value)} values]"
+
+
+def for_another_name(arguments: Sequence[str], program: str, node: str) -> list[str]:
+    """What to warn of: parameters on a command line for the program's own name, of a node that is called otherwise.
+
+    ROS passes over what is for another node, so the node would go by its defaults.
+
+    Args:
+        arguments: the command line.
+        program: the node's name unless it is given another.
+        node: its full name.
+    """
+    own = node.rpartition("/")[2]
+    warned = []
+    for option, value in pairwise(arguments):
+        if option == "--params-file":
+            try:
+                sections = sections_of(Path(value))
+            except ParameterFileError:
+                continue  # ROS has read it in its own way
+        elif option in ("-p", "--param") and ":" in value.partition(":=")[0]:
+            sections = [value.partition(":")[0]]
+        else:
+            continue
+        meant = [section for section in sections if section.rpartition("/")[2] in (program, own)]
+        if meant and not any(is_for(section, node) for section in meant):
+            warned.append(
+                f"{value} gives this node, {node}, nothing: it is for {', '.join(meant)}; write /**/{own} instead"
+            )
+    return warned
 
 
 def as_float(value: Any) -> Any:
