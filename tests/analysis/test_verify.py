@@ -10,7 +10,7 @@ from tdof_npid_ros.analysis import AnalysisError, verify
 from tdof_npid_ros.analysis.verify import NO_PARAMETERS, UNKNOWN_STATE
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import main
-from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.controller import Controller, parameters_digest
 from tdof_npid_ros.control.options import PLAIN
 
 
@@ -215,3 +215,50 @@ def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_pa
             answer = joint_state(stamp, f"{controller.digest} {label}", [1.0], controller.effort)
             bag.write("control_effort", JOINT_STATE, answer)
     assert verify.verify(tmp_path / "bag").equal == 300
+
+
+@pytest.mark.parametrize(
+    ("step", "applied", "status"),
+    [
+        (50, None, 0),  # as it was
+        (50, 1e6, 1),  # never an effort
+        (50, -0.0, 1),  # one bit
+        (50, 2.0, 0),  # at the plant's limit, which an effort goes beyond
+        (50, 0.25, 0),  # the fallback
+    ],
+)
+def test_an_applied_effort_in_realtime_is_a_recorded_one_within_the_limits_or_the_fallback(
+    tmp_path, case, step, applied, status
+) -> None:
+    limited = replace(case, effort_limits=(-2.0, 2.0))
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(limited, case.gains)
+        bag.parameters("plant", {"mode": "realtime", "fallback": "effort", "fallback_effort": 0.25})
+        controller = Controller(case.gains, case.sample_period_ns)
+        before = 0.0
+        for k in range(100):
+            stamp, y = k * case.sample_period_ns, np.array([0.5 * np.sin(k / 30)])
+            told = applied if k == step and applied is not None else before
+            bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
+            controller.answer(stamp, np.ones(1), y)
+            before = float(np.clip(controller.effort[0], -2.0, 2.0))
+            answer = joint_state(stamp, f"{controller.digest} -/0011aabb.1", [1.0], controller.effort)
+            bag.write("control_effort", JOINT_STATE, answer)
+    account = verify.verify(tmp_path / "bag")
+    assert account.status == status, account.lines()
+
+
+def test_the_law_alone(tmp_path, case, capsys) -> None:
+    """Outputs without applied efforts and plans that are missing do not matter to it."""
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        run, digest = case.simulate("setpoint"), parameters_digest(case.gains, case.sample_period_ns)
+        for k in range(len(run.time)):
+            stamp, frame = k * case.sample_period_ns, f"{case.plans['setpoint'].digest}/1"
+            bag.write("measured", JOINT_STATE, joint_state(stamp, frame, run.output[k]))
+            bag.write("u", JOINT_STATE, joint_state(stamp, f"{digest} {frame}", [1.0], run.control_effort[k]))
+    names = ["--output", "/measured", "--effort", "/u"]
+    assert main(["verify", str(tmp_path / "bag"), *names, "--law-only"]) == 0
+    assert "401 control efforts verified" in capsys.readouterr().out
+    assert main(["verify", str(tmp_path / "bag"), *names]) == 3
+    assert "their plan is not in the bag" in capsys.readouterr().out
