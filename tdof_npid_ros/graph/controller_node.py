@@ -25,7 +25,7 @@ from tdof_npid_ros.control.options import ControllerOptions, options_from_mappin
 from tdof_npid_ros.control.session import FAR_IN_SIGMA, OFF_RATE, OUT_OF_STEP, STUCK, Answer, Outcome, Session
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
-from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, shortened
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS, signal_qos
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.one_line import one_line
@@ -51,6 +51,7 @@ class ControllerNode(LoopEnd):
         self.controller.warm_up()
         self.joints = Joints(given["joint_names"])
         self.session = Session(self.controller, self.joints)
+        self.commanded = False  # the topic gives the setpoint, since the activation
         self.checked(given)
         self.changed({name: given[name] for name in ("setpoint", "output_timeout")})
         self.accept_changes()
@@ -60,6 +61,7 @@ class ControllerNode(LoopEnd):
         self.prepare_for_realtime()
         self.session.begin()
         self.why_refused = ""  # the latest output, if that was
+        self.commanded = False
         self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
         self.effort = SignalWriter()
         self.effort_label: AnswerLabel | None = None
@@ -102,6 +104,7 @@ class ControllerNode(LoopEnd):
         except ValueError as error:
             self.refuse("rejected", "setpoint refused", f": it {error}")
             return
+        self.commanded = True
         self.session.set_setpoint(r)
         if self.session.is_setpoint_far:
             self.warn_once(
@@ -197,6 +200,12 @@ class ControllerNode(LoopEnd):
         gains, _ = self._configured(changes)
         if not self.sigma_is_given and "sigma" not in changes:
             _check_sigma(gains.type, "")
+        if "setpoint" in changes and self.commanded and not self._is_setpoint_of_now(changes["setpoint"]):
+            raise ValueError(
+                f"the topic {self.resolve_topic_name('setpoint')} gives the setpoint, now "
+                f"{shortened(self.session.lanes_setpoint.tolist())}: publish there, or deactivate and activate the "
+                "controller to go by the parameter"
+            )
         setpoint = np.atleast_1d(changes["setpoint"]) if "setpoint" in changes else self.session.setpoint
         if len(setpoint) not in (1, gains.lanes):
             raise ValueError(
@@ -209,10 +218,18 @@ class ControllerNode(LoopEnd):
         self.sigma_is_given |= "sigma" in changes
         if changes.keys() & (GAINS.keys() | OPTIONS.keys()):
             self.controller.change(*self._configured(changes))
-        if "setpoint" in changes:
+        if "setpoint" in changes and self.commanded:
+            self.get_logger().info("the parameter setpoint does nothing: the topic gives the setpoint, and it stays")
+        elif "setpoint" in changes:
             self.session.set_setpoint(np.atleast_1d(changes["setpoint"]))
         if "output_timeout" in changes:
             self.session.timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
+
+    def _is_setpoint_of_now(self, value: Any) -> bool:
+        """Whether a value is that of the parameter as it stands, of a dump for one, or the setpoint as commanded."""
+        new, of_lanes = np.atleast_1d(value), self.session.lanes_setpoint
+        before = np.atleast_1d(self.values_of(["setpoint"])["setpoint"])
+        return np.array_equal(new, before) or bool(len(new) in (1, len(of_lanes)) and (new == of_lanes).all())
 
     def _configured(self, changes: dict[str, Any]) -> tuple[Gains, ControllerOptions]:
         """Gains and options with some parameters changed; ValueError if they are not valid."""

@@ -395,6 +395,42 @@ def test_a_parameter_dump_restores_the_controller(graph: Any) -> None:
     assert graph.fact("/b/controller", "parameters") == graph.fact("/a/controller", "parameters")
 
 
+def test_loading_a_dump_moves_nothing_once_the_topic_commands(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start("controller", kp=2.0, type="pid", setpoint=0.5)
+    output, setpoint = graph.publisher("output", JointState), graph.publisher("setpoint", JointState)
+    message = JointState(position=[0.25])
+
+    def position() -> float:
+        message.header.stamp.sec += 1
+        stamp = message.header.stamp
+        graph.publish_until(output, message, lambda: efforts and efforts[-1].header.stamp == stamp, what="an answer")
+        return efforts[-1].position[0]
+
+    assert position() == 0.5
+    graph.publish_until(setpoint, JointState(position=[2.0]), lambda: position() == 2.0, what="the setpoint")
+    (other,) = graph.set_parameters("/controller", setpoint=1.0)
+    assert not other.successful and "the topic /setpoint gives the setpoint, now [2.0]" in other.reason
+    for same in (0.5, 2.0):  # as a dump has it, and as it is
+        with graph.expect_log(controller, "the parameter setpoint does nothing"):
+            assert graph.set_parameters("/controller", setpoint=same)[0].successful
+    assert position() == 2.0
+    assert graph.set_parameters("/controller", kp=2.0)[0].successful
+    assert "kp: " not in controller.log  # it is what it was
+    assert graph.change_state("/controller", "deactivate") and graph.change_state("/controller", "activate")
+    assert graph.set_parameters("/controller", setpoint=1.0)[0].successful
+    assert position() == 1.0
+
+
+def test_of_a_long_array_the_log_shows_the_beginning() -> None:
+    from tdof_npid_ros.graph.runtime.node import shortened
+
+    assert shortened([1.0, 2.0]) == "[1.0, 2.0]" and shortened("text" * 9) == "text" * 9
+    assert shortened([float(k) for k in range(100)]) == "[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, … 100 values]"
+
+
 def test_deadline_and_liveliness_of_a_publisher_that_stops_are_counted(graph: Any) -> None:
     promises = {"deadline": 0.1, "lease": 0.5, "request_deadline": True}
     live = Live(graph, "/promising", promises, promises)
