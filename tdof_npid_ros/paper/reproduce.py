@@ -29,6 +29,7 @@ from tdof_npid_ros.paper.items import ITEMS, Evaluated
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
 from tdof_npid_ros.paper.report import Figure, Finding, Table
+from tdof_npid_ros.paper.robust import price_of_robustness
 from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, ROWS
 from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
 from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front, poorer_of
@@ -229,7 +230,7 @@ class Reproduction:
             yield Section("What reproduces", (at_a_glance(self.rows),))
             yield Section(
                 "The paper's conclusions on our numbers",
-                (against_pid(self.rows), against_published(self.rows)),
+                (against_pid(self.rows), against_published(self.rows), price_of_robustness(self.rows)),
             )
             yield Section("What does not reproduce, and why", self.findings)
         for title, names in SECTIONS.items():

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tdof_npid_ros.cli import main
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.control.law import KD_H, PHI, coefficients
 from tdof_npid_ros.paper import findings
 from tdof_npid_ros.paper.conclusions import TOLERANCES
@@ -20,7 +22,12 @@ from tdof_npid_ros.paper.output import MARKER, OutputError, claim_folder
 from tdof_npid_ros.paper.pages import Section, html_page
 from tdof_npid_ros.paper.report import Figure, Table, shown_cell
 from tdof_npid_ros.paper.reproduce import Effort, Reproduction, reproduce
+from tdof_npid_ros.paper.robust import robust
 from tdof_npid_ros.paper.tables import CASES, ROWS, VARIATIONS, Published, PublishedVariation
+from tdof_npid_ros.paper.tuned import tuned
+from tdof_npid_ros.tuning.judge import Constraints
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
 
 QUICK = Effort(seeds=1, generations=3, pareto_generations=3)
 REPRODUCED_CASES = ("p1-c4", "p2-c2", "p2-c5")
@@ -207,6 +214,35 @@ def test_most_rows_come_out_in_the_inferred_simulation() -> None:
 def test_printed_gains_are_optimal_in_the_inferred_simulation_only(row: Published) -> None:
     assert optimality(row, inferred).excess_percent <= OPTIMAL
     assert optimality(row, as_stated).excess_percent > 5.0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_tuned_gains_are_of_loops_whose_objective_does_not_change_with_longer_episodes(case: str) -> None:
+    short = paper_case(case)
+    for kind in CONTROLLER_TYPES:
+        row = tuned(case, kind)
+        assert row is not None
+        problem = TuningProblem(short, kind)
+        candidate = candidate_of(problem, row.gains)
+        scores = Objective(problem)(candidate)
+        assert scores.objective[0] == pytest.approx(row.objective, rel=1e-12)
+        assert scores.violation[0] == 0.0
+        for times in (3, 10):
+            end = times * short.plans["setpoint"].end_ns / 1e9
+            episodes = {name: (short.episodes[name][0], f"{end} end") for name in ("setpoint", "disturbance")}
+            longer = Objective(TuningProblem(replace(short, episodes=episodes), kind))(candidate)
+            assert longer.objective[0] == pytest.approx(row.objective, rel=1e-3)
+
+
+def test_robust_gains_have_the_margin_of_their_level_at_a_price() -> None:
+    for (case, kind, level), row in robust().items():
+        problem = TuningProblem(paper_case(case), kind, constraints=Constraints(ms=level))  # type: ignore[arg-type]
+        scores = Objective(problem)(candidate_of(problem, row.gains))
+        assert scores.violation[0] == 0.0
+        assert scores.objective[0] == pytest.approx(row.objective, rel=1e-12)
+        free = tuned(case, kind)  # type: ignore[arg-type]
+        assert free is not None
+        assert row.objective > 0.999 * free.objective
 
 
 def test_a_table_shows_repeated_keys_once() -> None:
