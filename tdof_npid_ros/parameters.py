@@ -302,6 +302,12 @@ PLANT: Final = table(
     Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit", of_loop=True),
     *NOISE.values(),
     Parameter(
+        "start",
+        math.inf,
+        "output at which plant/reset begins, at rest; inf: as the model begins; a plan's start stands above it",
+        "the output's unit",
+    ),
+    Parameter(
         "reply_timeout",
         0.5,
         "lockstep: wall time until an unanswered output is repeated",

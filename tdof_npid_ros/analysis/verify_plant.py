@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 from tdof_npid_ros.analysis.account import Difference, Verification, numbers
 from tdof_npid_ros.analysis.recording import Loop, Signal
 from tdof_npid_ros.control.joints import Joints
-from tdof_npid_ros.parameters import sample_period_in_ns
+from tdof_npid_ros.parameters import PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.plants.plant import Plant, PlantAt, PlantError
@@ -229,9 +230,20 @@ def _allowed(values: Values, recorded: list[np.ndarray], lanes: int) -> set[byte
     fallback = float(values.get("fallback_effort", 0.0)) if values.get("fallback") == "effort" else 0.0
     possible = [effort for effort in recorded if effort.size == lanes]
     without = np.zeros(lanes)  # before the first effort, limited or not
+    further = (np.full(lanes, fallback), np.full(lanes, _resting_effort(values)), without)
     return {without.tobytes()} | {
-        np.minimum(np.maximum(effort, low), high).tobytes() for effort in (*possible, np.full(lanes, fallback), without)
+        np.minimum(np.maximum(effort, low), high).tobytes() for effort in (*possible, *further)
     }
+
+
+def _resting_effort(values: Values) -> float:
+    """The effort with which the plant begins, at rest; 0 where it is not known."""
+    try:
+        plant = make_plant(str(values.get("model", PLANT["model"].default)), values)
+        start = float(values.get("start", math.inf))
+        return (plant.at_rest(start) if math.isfinite(start) else plant).initial_effort
+    except (PlantError, TypeError):
+        return 0.0
 
 
 def _is_between(applied: np.ndarray, values: Values, recorded: list[np.ndarray]) -> bool:

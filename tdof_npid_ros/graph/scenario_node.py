@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import replace
 from typing import Any
@@ -44,6 +45,7 @@ class ScenarioNode(LoopNode):
         self._read_plans({})
         self.accept_changes()
         self.played = 0
+        self.placed_at = math.inf  # the plant's `start`, as far as it was set here
         self.label: EpisodeLabel | None = None  # of the plant's episode, as it tells; None: it has told nothing yet
         self.queue: list[Plan] = []
         self.current: Plan | None = None
@@ -105,6 +107,7 @@ class ScenarioNode(LoopNode):
         self.begun = False  # in lockstep: the plan is published; in realtime: it is played
         self.started_ns = 0
         self.told: Question[dict[str, Any]] | None = None  # what the plan will change of the plant
+        self.placing: Question[dict[str, str]] | None = None  # where the plant begins
         self.resetting: Question[str] | None = None
         self.wait_until_ns = STEADY.now().nanoseconds + PLANT_TIMEOUT_NS
         if self.mode == "lockstep":
@@ -175,20 +178,24 @@ class ScenarioNode(LoopNode):
 
     def _publish_signals(self, plan: Plan, point: int) -> None:
         row = dict(zip(plan.names, plan.values[point], strict=True))
-        for name, publisher in self.publishers_of.items():
-            message = signal_message("")
-            message.name = lane_names(1) if name == "disturbance" else []  # a setpoint's are names of joints
-            set_stamp(message.header.stamp, plan.times_ns[point])
-            field = "position" if name == "setpoint" else "effort"
-            setattr(message, field, [row.get(name, 0.0)])
-            publisher.publish(message)
+        for name in self.publishers_of:
+            self._publish(name, plan.times_ns[point], row.get(name, 0.0))
+
+    def _publish(self, name: str, time_ns: int, value: float) -> None:
+        message = signal_message("")
+        message.name = lane_names(1) if name == "disturbance" else []  # a setpoint's are names of joints
+        set_stamp(message.header.stamp, time_ns)
+        setattr(message, "position" if name == "setpoint" else "effort", [value])
+        self.publishers_of[name].publish(message)
 
     # The plant, in realtime
 
     def _begin_if_ready(self, plan: Plan, now: int) -> None:
         """Play once the plant has its own parameters again, has told them, and has begun from its initial state."""
         late = now > self.wait_until_ns
-        if not late and not (self._is_restored() and self._is_known(plan) and self._is_reset()):
+        if not late and not (
+            self._is_restored() and self._is_known(plan) and self._is_placed(plan) and self._is_reset()
+        ):
             return
         if self.resetting is None:
             self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
@@ -209,6 +216,19 @@ class ScenarioNode(LoopNode):
         if not self.told.look():
             return False
         self.plant_before = {name: value for name, value in self.told.answer.items() if value is not None}
+        return True
+
+    def _is_placed(self, plan: Plan) -> bool:
+        """Whether the plant has been told where to begin, at rest, if it must be; the setpoint is there then."""
+        start = math.inf if plan.start is None else plan.start
+        if self.placing is None and start != self.placed_at:
+            self.placing, self.placed_at = self.plant.ask_to_set_each({"start": start}), start
+        if self.placing is None or not self.placing.look():
+            return self.placing is None
+        if plan.start is not None and self.resetting is None:
+            if "start" in self.placing.answer:
+                self.refuse("rejected", "the plant cannot begin at rest", f": {self.placing.answer['start']}")
+            self._publish("setpoint", 0, plan.start)
         return True
 
     def _is_reset(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import sys
 from collections.abc import Callable
@@ -17,9 +18,9 @@ from tdof_npid_ros.graph.runtime.messages import lane_names
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.parameters import NOISE
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
-from tdof_npid_ros.plants.noise import in_episode
 from tdof_npid_ros.plants.plant import Plant, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
 
 EPISODE = "episode"  # the topic
@@ -124,8 +125,10 @@ class PlantPort:
 
     def new_simulator(self, episode: int = 0) -> PlantSimulator:
         """The plant at its initial state, with the parameters as they are now and the noise of an episode."""
-        lanes = self.node.values_of(["lanes"])["lanes"]
-        return PlantSimulator(in_episode(self.plant_at({}), episode), self.period_ns, lanes, self.effort_limits())
+        p = self.node.values_of(["lanes", "start"])
+        start, limits = p["start"] if math.isfinite(p["start"]) else None, self.effort_limits()
+        plant = plant_at_start(self.plant_at, start, {}, limits, episode)
+        return PlantSimulator(plant, self.period_ns, p["lanes"], limits)
 
     def effort_limits(self) -> tuple[float, float]:
         """The actuator's."""

@@ -43,6 +43,9 @@ class RealtimePlant:
         lanes = self._port.simulator.lanes
         self.disturbance = np.zeros(lanes)
         self.failsafe = FailSafe(lanes, *self._failsafe_settings())
+        resting = self._port.simulator.applied_effort
+        if resting.any():  # it begins with the effort that holds it where it is, as if that had just come
+            self.failsafe.take(resting.copy(), STEADY.now().nanoseconds)
         self.step = 0
         self.first_tick_ns: int | None = None
         self.output_ns = (0, 0)  # stamp of the latest output, and when it was published
