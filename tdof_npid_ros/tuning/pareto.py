@@ -32,6 +32,9 @@ LARGEST_POPULATION = 2000  # NSGA-II compares each point with each other one
 POORER: dict[ControllerType, ControllerType] = {"tdof_npid1": "npid", "tdof_npid2": "tdof_npid1"}
 """The type that a type contains: with alpha, or beta, of 0."""
 
+LEAST_FOR_ENDS = 25
+"""Generations of the HGA for each end of a front, at least."""
+
 MOST_DISTURBANCE = 1e6
 """The weight with which hardly anything but IAE_DIS counts."""
 
@@ -172,7 +175,9 @@ def pareto_front(
             constraints=constraints,
         )
     case = foptd_case(ratio)
-    problem = TuningProblem(case, controller, constraints=constraints, seed=seed, generations=max(1, generations // 4))
+    problem = TuningProblem(
+        case, controller, constraints=constraints, seed=seed, generations=max(LEAST_FOR_ENDS, generations // 4)
+    )
     objective, space = Objective(problem), problem.space
     known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem), *(poorer.gains if poorer else ()))]
     starts = np.reshape(known, (-1, len(problem.names)))
@@ -185,7 +190,7 @@ def pareto_front(
 
     found = space.at(_nsga2(costs, space, space.of(starts), seed, population, generations, after_generation))
     candidates = np.unique(np.concatenate([starts, found]), axis=0)
-    iae, violation = costs(candidates)
+    iae, violation = costs(candidates) if len(candidates) else (np.empty((0, 2)), np.empty(0))
     candidates, iae = candidates[violation == 0.0], iae[violation == 0.0]
     if not len(candidates):
         raise TuningError(f"L/T = {ratio:g}: no {controller} was found that is allowed: ask for less, or search longer")
