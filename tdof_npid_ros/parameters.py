@@ -202,6 +202,27 @@ CONTROLLER: Final = table(
     ),
     Parameter("save_i_term", True, "keep the integral action while inactive"),
     JOINT_NAMES,
+    Parameter(
+        "output_from",
+        "",
+        "TOPIC TYPE FIELD [SCALE [OFFSET]] to take the output from; then published on output, too; empty: output",
+        fixed=True,
+        per_lane=True,
+    ),
+    Parameter(
+        "setpoint_from",
+        "",
+        "TOPIC TYPE FIELD [SCALE [OFFSET]] to take the setpoint from; empty: setpoint",
+        fixed=True,
+        per_lane=True,
+    ),
+    Parameter(
+        "effort_to",
+        "",
+        "TOPIC TYPE FIELD [SCALE [OFFSET]] to publish the effort in, besides control_effort; empty: nowhere else",
+        fixed=True,
+        per_lane=True,
+    ),
     *TIMING,
     AUTOSTART,
 )

@@ -18,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.controller import Controller
+from tdof_npid_ros.control.fields import FieldReader, FieldWriter, parse_fields
 from tdof_npid_ros.control.gains import TUNED, Gains, Lanes, gains_from_mapping
 from tdof_npid_ros.control.joints import SHOWN_NAMES, Joints
 from tdof_npid_ros.control.law import TERMS
@@ -26,8 +27,9 @@ from tdof_npid_ros.control.session import FAR_IN_SIGMA, OFF_RATE, OUT_OF_STEP, S
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, shortened
-from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS, signal_qos
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SENSOR_QOS, SIGNAL_QOS, signal_qos
 from tdof_npid_ros.graph.runtime.run import run_node
+from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import CONTROLLER, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
 from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
@@ -51,10 +53,45 @@ class ControllerNode(LoopEnd):
         self.controller.warm_up()
         self.joints = Joints(given["joint_names"])
         self.session = Session(self.controller, self.joints)
+        self._take_fields(given)
         self.commanded = False  # the topic gives the setpoint, since the activation
         self.checked(given)
         self.changed({name: given[name] for name in ("setpoint", "output_timeout")})
         self.accept_changes()
+
+    def _take_fields(self, given: dict[str, Any]) -> None:
+        """Where output and setpoint come from and the effort goes to, besides the loop's own topics.
+
+        Raises:
+            ValueError: a field cannot be read or written; the message names the parameter.
+        """
+        try:
+            name = "output_from"
+            self.output_from = self._reader(given[name], "output")
+            name = "setpoint_from"
+            self.setpoint_from = self._reader(given[name], "setpoint")
+            name = "effort_to"
+            fields = parse_fields(given[name])
+            self.effort_to = FieldWriter(fields, lambda kind: message_class(kind)()) if fields else None
+            for topic in self.effort_to.messages if self.effort_to else ():
+                self._check_is_another(topic, "control_effort")
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+
+    def _reader(self, texts: str | list[str], own: str) -> FieldReader | None:
+        fields = parse_fields(texts)
+        if not fields:
+            return None
+        reader = FieldReader(fields)
+        self._check_is_another(reader.topic, own)
+        empty = message_class(reader.type)()
+        for field in fields:
+            field.path.check(empty)
+        return reader
+
+    def _check_is_another(self, topic: str, own: str) -> None:
+        if self.resolve_topic_name(topic) == self.resolve_topic_name(own):
+            raise ValueError(f"{topic} is the controller's own topic {own}: remap that, or leave the parameter out")
 
     def activate(self) -> None:
         """Create topics, services and timers."""
@@ -71,9 +108,22 @@ class ControllerNode(LoopEnd):
         self.effort_publisher = self.publisher_of(JointState, "control_effort", qos, self._on_effort_matched)
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        self.subscribe_signal("setpoint", self._on_setpoint, signal_qos(10))
+        if self.setpoint_from is not None:
+            self.subscribe_fields(self.setpoint_from, self._on_setpoint, signal_qos(10))
+        else:
+            self.subscribe_signal("setpoint", self._on_setpoint, signal_qos(10))
         self.subscribe_signal("manual_effort", self._on_manual_effort, signal_qos(1))
-        self.subscribe_signal("output", self._on_output, self.requested_qos(), sole=True)
+        self.effort_to_publishers = {
+            topic: self.publisher_of(message_class(kind), topic, SIGNAL_QOS)
+            for topic, (kind, _) in (self.effort_to.messages.items() if self.effort_to else ())
+        }
+        if self.output_from is not None:
+            self.output = SignalWriter()
+            self.output_head: tuple[str, list[str]] = ("", [])
+            self.output_publisher = self.publisher_of(JointState, "output", SIGNAL_QOS)
+            self.subscribe_fields(self.output_from, self._on_output_from, SENSOR_QOS, sole=True)
+        else:
+            self.subscribe_signal("output", self._on_output, self.requested_qos(), sole=True)
         self.create_timer(SILENCE_LOOKS, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:
@@ -131,7 +181,28 @@ class ControllerNode(LoopEnd):
         outcome = self.session.take(output, time.monotonic_ns())
         if outcome.answer is not None:
             self.effort_publisher.publish(self._message(outcome.answer))
+            if self.effort_to is not None:
+                self._publish_effort_to(self.effort_to, outcome.answer)
         self._account_for(outcome)  # the plant waits for the answer, so all else comes after it
+
+    def _on_output_from(self, sample: Sample) -> None:
+        """Publish what is taken as `output`, so that recorder and `verify` have what was answered, and answer it."""
+        lanes = len(sample.position)
+        names = list(sample.name) or (self.joints.names if len(self.joints.names) == lanes else lane_names(lanes))
+        if self.output_head != (sample.frame_id, names):
+            self.output_head = sample.frame_id, names
+            self.output.label(*self.output_head)
+        self.output_publisher.publish(self.output.write(sample.stamp_ns, position=sample.position))
+        self._on_output(sample)
+
+    def _publish_effort_to(self, effort_to: FieldWriter, answer: Answer) -> None:
+        try:
+            effort_to.write(answer.stamp_ns, answer.effort)
+        except ValueError as error:
+            self.refuse("rejected", "effort not published in effort_to", f": {error}")
+            return
+        for topic, (_, message) in effort_to.messages.items():
+            self.effort_to_publishers[topic].publish(message)
 
     def _message(self, answer: Answer) -> bytes:
         if answer.label is not self.effort_label:
@@ -192,7 +263,7 @@ class ControllerNode(LoopEnd):
         numbers = ", ".join(f"{name} {_short(getattr(gains, name))}" for name in (*TUNED[gains.type], "sigma"))
         joints = f" for {', '.join(self.joints.names[:SHOWN_NAMES])}" if self.joints.names else ""
         rate = 1e9 / self.controller.sample_period_ns
-        output = self.resolve_topic_name("output")
+        output = self.resolve_topic_name(self.output_from.topic if self.output_from else "output")
         return f"{gains.type}{joints}, {numbers}, {rate:g} Hz, waiting for {output}"
 
     def checked(self, changes: dict[str, Any]) -> None:
@@ -242,6 +313,8 @@ class ControllerNode(LoopEnd):
                 f"the gains are for {gains.lanes} lanes, but joint_names has {len(self.joints.names)} names: give one "
                 "value, or one per joint"
             )
+        if self.effort_to is not None and not self.effort_to.fits(gains.lanes):
+            raise ValueError(f"effort_to has no field for each of {gains.lanes} lanes: give one per lane")
         if gains.lanes != self.controller.lanes and self._answers_live_outputs:
             raise ValueError(
                 f"the gains are for {gains.lanes} lanes, but the loop that runs has {self.controller.lanes}: "
@@ -266,6 +339,8 @@ class ControllerNode(LoopEnd):
             return WARN, "an output waits for its plan on scenario_plan: start the scenario", facts
         if session.stamp_ns is None and self.why_refused:
             return ERROR, one_line(self.why_refused), facts
+        if session.stamp_ns is None and self.output_from is not None:
+            return WARN, f"nothing on {self.output_from.topic} yet, where output_from takes the output from", facts
         if session.stamp_ns is None:
             return WARN, "no output yet: start the plant, or remap output to your robot's joint_states", facts
         facts["time_s"] = session.stamp_ns / 1e9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -21,13 +22,16 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.bag import schema
-from tdof_npid_ros.bag.cdr import decode
+from tdof_npid_ros.bag.cdr import decode, decode_with
 from tdof_npid_ros.bag.definition import parse
+from tdof_npid_ros.bag.errors import BagError
+from tdof_npid_ros.control.fields import FieldReader
 from tdof_npid_ros.graph.runtime.endpoints import Endpoints
 from tdof_npid_ros.graph.runtime.messages import diagnostics_message
 from tdof_npid_ros.graph.runtime.own_services import guard_services
 from tdof_npid_ros.graph.runtime.realtime import collect_garbage
 from tdof_npid_ros.graph.runtime.unread import take_unread
+from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameter import Parameter, Table, infinity_as_float
 from tdof_npid_ros.parameter_file import ParameterFileError, is_for, sections_of
@@ -123,7 +127,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self,
         message_type: Any,
         topic: str,
-        callback: Callable[[Any], None],
+        callback: Callable[..., None],
         qos: QoSProfile,
         sole: bool = False,
         raw: bool = False,
@@ -147,6 +151,28 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
                 callback(sample)
 
         self.subscribe(JointState, topic, on_data, qos, sole, raw=True)
+
+    def subscribe_fields(
+        self, fields: FieldReader, callback: Callable[[Sample], None], qos: QoSProfile, sole: bool = False
+    ) -> None:
+        """As `subscribe_signal`, to fields of a topic of any installed type.
+
+        Raises:
+            ValueError: the type is not installed, or has no such field.
+        """
+        topic, definition = fields.topic, parse(fields.type, schema.definition(fields.type))
+
+        def on_data(*taken: Any) -> None:
+            data, info = taken if len(taken) == 2 else taken[0]  # the events executor passes both as one
+            try:
+                sample = fields.read(decode_with(definition, data), info["source_timestamp"])
+            except (ValueError, BagError) as error:
+                self.refuse("rejected", f"{topic} refused", f": {error}")
+            else:
+                callback(sample)
+
+        on_data.__signature__ = _WITH_INFO  # type: ignore[attr-defined]  # by it rclpy knows that info is asked for
+        self.subscribe(message_class(fields.type), topic, on_data, qos, sole, raw=True)
 
     # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due
     # before.
@@ -422,6 +448,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
                 entity.destroy = _do_nothing
                 take_out_and_destroy(entity)
         self.endpoints.forget()
+
+
+_WITH_INFO = inspect.signature(lambda message, info: None)
 
 
 def _do_nothing() -> None:

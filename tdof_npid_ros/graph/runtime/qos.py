@@ -20,4 +20,5 @@ def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0) -> QoSProf
 SIGNAL_QOS = signal_qos(1000)
 RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
 RECENT_QOS = signal_qos(RECENT)
+SENSOR_QOS = QoSProfile(depth=RECENT, reliability=ReliabilityPolicy.BEST_EFFORT)  # hears reliable publishers, too
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

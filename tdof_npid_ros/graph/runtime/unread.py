@@ -28,7 +28,8 @@ def _serve_subscription(subscription: Any) -> int:
     served = 0
     with handle:
         while served < MOST_AT_ONCE and (taken := handle.take_message(kind, raw)) is not None:
-            subscription.callback(taken[0])
+            with_info = subscription._callback_type is subscription.CallbackType.WithMessageInfo
+            subscription.callback(*(taken if with_info else taken[:1]))
             served += 1
     return served
 

@@ -1,0 +1,64 @@
+"""The output and the setpoint from fields of any topic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdof_npid_ros.control.fields import FieldReader, parse_fields
+from tdof_npid_ros.field_path import FieldPathError
+
+HEADER = {"stamp": {"sec": 3, "nanosec": 5}, "frame_id": "imu"}
+IMU = {"header": HEADER, "angular_velocity": {"x": 1.0, "y": 2.0, "z": 3.0}}
+JOINTS = {"header": HEADER, "name": ["a", "b"], "position": np.array([1.0, 2.0]), "velocity": np.array([3.0, 4.0])}
+STAMPED, SENT_NS = 3_000_000_005, 7
+
+
+def read(texts: Any, message: Any) -> Any:
+    return FieldReader(parse_fields(texts)).read(message, SENT_NS)
+
+
+@pytest.mark.parametrize(
+    ("texts", "message", "names", "values", "stamp_ns"),
+    [
+        ("/imu sensor_msgs/msg/Imu angular_velocity.z", IMU, (), [3.0], STAMPED),
+        ("/imu sensor_msgs/Imu angular_velocity.z 2", IMU, (), [6.0], STAMPED),
+        ("/imu sensor_msgs/msg/Imu angular_velocity.z -2 0.5", IMU, (), [-5.5], STAMPED),
+        (["/imu sensor_msgs/msg/Imu angular_velocity.z", "/imu sensor_msgs/msg/Imu angular_velocity.x 10"], IMU, (),
+         [3.0, 10.0], STAMPED),
+        ("/js sensor_msgs/msg/JointState velocity", JOINTS, ("a", "b"), [3.0, 4.0], STAMPED),
+        ("/js sensor_msgs/msg/JointState velocity[b]", JOINTS, (), [4.0], STAMPED),
+        ("/level std_msgs/msg/Float64 data", {"data": 0.25}, (), [0.25], SENT_NS),
+    ],
+)  # fmt: skip
+def test_fields_are_lanes_with_scale_offset_and_stamp(
+    texts: Any, message: Any, names: tuple[str, ...], values: list[float], stamp_ns: int
+) -> None:
+    sample = read(texts, message)
+    assert (sample.name, sample.position.tolist(), sample.stamp_ns) == (names, values, stamp_ns)
+
+
+def test_nothing_given_is_no_field() -> None:
+    assert parse_fields("") == parse_fields([""]) == []
+
+
+@pytest.mark.parametrize(
+    ("texts", "reason"),
+    [
+        ("/imu angular_velocity.z", "no field with its type"),
+        ("/imu:angular_velocity.z", "no field with its type"),
+        ("/imu sensor_msgs/msg/Imu angular_velocity.z x", "must be numbers"),
+        ("/imu sensor_msgs/msg/Imu angular_velocity.z 0", "the scale not 0"),
+        ("/imu sensor_msgs/msg/Imu angular_velocity.z 1 inf", "finite"),
+        ("/imu sensor_msgs/msg/Imu z 1 2 3", "no field with its type"),
+        ("/i-mu sensor_msgs/msg/Imu z", "is no topic"),
+        (["/a std_msgs/msg/Float64 data", "/b std_msgs/msg/Float64 data"], "from 2 topics"),
+        ("/imu sensor_msgs/msg/Imu angular_velocity.w", "no field 'w'"),
+        ("/imu sensor_msgs/msg/Imu angular_velocity", "leads to no number"),
+    ],
+)
+def test_what_is_no_field_is_refused_with_the_reason(texts: Any, reason: str) -> None:
+    with pytest.raises(FieldPathError, match=reason):
+        read(texts, IMU)
