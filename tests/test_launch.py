@@ -52,7 +52,7 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, name, module)
 
 
-def started(name: str, **given: str) -> list[Made]:
+def started(name: str, /, **given: str) -> list[Made]:
     """What a launch file starts with these arguments, the others at their defaults."""
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.launch.py")
     assert spec is not None and spec.loader is not None

@@ -1,11 +1,13 @@
 """The package installs with colcon as an ament_python package, and a node starts from the installed tree."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -40,7 +42,8 @@ def test_colcon_installs_what_ros2_run_and_launch_look_for(installed: Path) -> N
     share = installed / "share"
     assert (share / "ament_index" / "resource_index" / "packages" / "tdof_npid_ros").is_file()
     assert (share / "tdof_npid_ros" / "package.xml").is_file()
-    assert (share / "tdof_npid_ros" / "launch" / "demo.launch.py").is_file()
+    launch = {path.name for path in (share / "tdof_npid_ros" / "launch").iterdir()}
+    assert {"demo.launch.py", "loop.launch.py", "controller.launch.py"} <= launch
     assert len(list((share / "tdof_npid_ros" / "config").glob("*.yaml"))) >= 7
 
 
@@ -84,3 +87,13 @@ def test_pip_installs_ros_only_when_asked() -> None:
     text = (ROOT / "setup.py").read_text()
     required = text[text.index("install_requires") : text.index("extras_require")]
     assert "ros-jazzy" not in required
+
+
+def test_the_package_names_what_its_messages_and_launch_files_need() -> None:
+    package = ElementTree.parse(ROOT / "package.xml").getroot()
+    needed = {one.text for one in package.iter("exec_depend")}
+    imported = re.compile(r"^from (\w+_msgs|launch|launch_ros|std_srvs|rclpy)\b", re.MULTILINE)
+    sources = [*(ROOT / "tdof_npid_ros").rglob("*.py"), *(ROOT / "launch").glob("*.py")]
+    assert {name for source in sources for name in imported.findall(source.read_text())} <= needed
+    for name in ("url", "author", "maintainer", "license", "test_depend"):
+        assert package.findtext(name), name
