@@ -41,6 +41,7 @@ class Case:
         episodes: the scenario's lines by episode, in the order in which they run.
         bounds: of the tuner's search, by gain.
         weight: w of the objective (10).
+        search: what else the file gives the tuner, by the names of its parameters: `free`, `ms`, …
     """
 
     name: str
@@ -53,6 +54,7 @@ class Case:
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     weight: float = WEIGHT.default
     options: ControllerOptions = PLAIN
+    search: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def sample_period(self) -> float:
@@ -271,6 +273,7 @@ def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | N
         bounds=read_bounds(tuner),
         weight=tuner.get("weight", WEIGHT.default),
         options=options_from_mapping(controller),
+        search=tuner,
     )
     _ = case.plant, case.plans
     case = _with_scale(case, "sigma" in controller)

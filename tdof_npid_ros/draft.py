@@ -156,6 +156,7 @@ class Draft:
         sample_period: s; None: chosen.
         disturbance: of the second episode, in the effort's unit; None: chosen.
         controller: the type.
+        ms: largest M_s of tuned gains; None: any, where the plant has no margins.
         title: the first line, a comment.
     """
 
@@ -169,6 +170,7 @@ class Draft:
     sample_period: float | None = None
     disturbance: float | None = None
     controller: ControllerType = "tdof_npid2"
+    ms: float | None = 2.0
     title: str = "A loop"
     notes: tuple[str, ...] = field(default=())
 
@@ -282,6 +284,12 @@ class Draft:
             "/**/tuner:",
             "  ros__parameters:",
             "    weight: 1.0  # of the disturbance episode's error, beside the setpoint episode's",
+            "    free: sigma  # searched, too, where the type has one",
+            *(
+                [f"    ms: {self.ms:g}  # gains with a larger M_s, nearer to instability, are not taken"]
+                if self.ms
+                else []
+            ),
             "    bounds:",
         ]
         lines += [f"      {name}: {_yaml(self._bounds(name, value, used))}" for name, value in used.items()]

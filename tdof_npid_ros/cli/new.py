@@ -7,17 +7,19 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
-from tdof_npid_ros.draft import Draft, Process, process_of
+from tdof_npid_ros.draft import Draft, Process, process_of, significant
 from tdof_npid_ros.output_file import OutputError, check_writable
 from tdof_npid_ros.parameter_file import ParameterFileError
 from tdof_npid_ros.parameters import GAINS
 from tdof_npid_ros.plants.catalog import make_plant, named_model
 from tdof_npid_ros.plants.ode import Ode
+from tdof_npid_ros.stability.margins import margins
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     draft = _draft(arguments)
     path.write_text(draft.text(), encoding="utf-8")
     try:
-        load_case(path)
+        if (ms := _reachable(load_case(path), draft.ms)) != draft.ms:
+            path.write_text(replace(draft, ms=ms).text(), encoding="utf-8")
     except ValueError:
         path.unlink()  # it would be our own mistake, and must not be left to the user
         raise
@@ -67,6 +70,14 @@ def run(arguments: argparse.Namespace) -> int:
         for line in ("check {0}", "simulate {0} --plot response.png", "tune {0} --out tuned.yaml"):
             print(f"next     tdof-npid {line.format(path)}")
     return 0
+
+
+def _reachable(case: Case, ms: float | None) -> float | None:
+    """The limit of M_s, or a wider one where even the first gains are beyond it; None where there are no margins."""
+    found = margins(case, case.gains)
+    if found.m_s is None or ms is None:
+        return None
+    return ms if found.m_s <= ms else significant(1.1 * found.m_s, 2)
 
 
 def _draft(arguments: argparse.Namespace) -> Draft:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import (
     add_output_arguments,
@@ -87,9 +87,12 @@ def add_constraint_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--delay-margin", type=float, metavar="S", help="least additional dead time")
 
 
-def constraints_of(arguments: argparse.Namespace) -> Constraints:
-    """What `add_constraint_arguments` were given."""
-    return Constraints(**{field.name: getattr(arguments, field.name) for field in fields(Constraints)})
+def constraints_of(arguments: argparse.Namespace, case: Case | None = None) -> Constraints:
+    """What `add_constraint_arguments` were given, or else the case's file gives the tuner."""
+    of_case = case.search if case else {}
+    names = [field.name for field in fields(Constraints)]
+    asked = {name: getattr(arguments, name) for name in names}
+    return Constraints(**{name: of_case.get(name) or None if asked[name] is None else asked[name] for name in names})
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -144,7 +147,8 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         if arguments.budget < arguments.population:
             raise TuningError(f"a budget of {arguments.budget} is less than one population of {arguments.population}")
         generations = arguments.budget // max(arguments.population, 1)
-    extra = (arguments.free,) if arguments.free else ()
+    free = arguments.free or (case.search.get("free") if controller != "pid" else None)
+    extra = (free,) if free else ()
     return TuningProblem(
         case,
         controller,
@@ -155,7 +159,7 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         arguments.population,
         generations,
         arguments.polish,
-        constraints_of(arguments),
+        constraints_of(arguments, case),
         warm=not arguments.cold,
         until_converged=arguments.until_converged,
     )

@@ -137,7 +137,7 @@ class TunerNode(LoopNode):
         return TuningProblem(
             case,
             given["type"],
-            (given["free"],) if given["free"] else (),
+            (given["free"],) if given["free"] and given["type"] != "pid" else (),
             case.weight,
             given["algorithm"],
             given["seed"],
