@@ -18,11 +18,13 @@ from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.linearise import linearised
 from tdof_npid_ros.plants.ode import Ode
 from tdof_npid_ros.plants.plant import PlantError
+from tdof_npid_ros.stability.margins import margins
 
 Severity = Literal["error", "warning", "hint"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "hint")
 INACCURATE = 0.01  # of an episode's range, by which half the integration step may change it
 RUNGE_KUTTA = 2.78  # |λ| times the step up to which the fourth-order method is stable on the real axis
+USUAL_M_S = 2.0  # largest M_s that is usual
 ACCURATE = 0.5  # |λ| times the step up to which its error is below 1e-3 a time constant
 COARSE, FINE = 10.0, 20_000.0  # samples per closed-loop time that are too few, and more than serve anything
 ODD_EFFORT = (1e-3, 1e3)  # effort that a step takes, as a fraction of the limits' distance, beyond which units differ
@@ -57,8 +59,8 @@ def advice(case: Case, runs: dict[str, Trajectory] | None = None) -> list[Advice
 
     Example:
         >>> from tdof_npid_ros.case import load_case
-        >>> advice(load_case("p1-c0.5"))
-        []
+        >>> [one.severity for one in advice(load_case("p1-c0.5"))]  # M_s is 2.35
+        ['hint']
     """
     found: list[Advice] = []
     for look in LOOKS_AT_THE_FILE:
@@ -201,8 +203,22 @@ def _angles(case: Case) -> Iterator[Advice]:
         )  # fmt: skip
 
 
+def _margins(case: Case) -> Iterator[Advice]:
+    if case.gains.lanes > 1:
+        return
+    found = margins(case, case.gains)
+    if found.stable is False:
+        yield Advice("error", "gains", f"the loop is unstable ({found.reason})", "take smaller gains, or tune")
+    elif found.m_s is not None and found.m_s > USUAL_M_S:
+        yield Advice(
+            "hint", "gains",
+            f"M_s is {found.m_s:.2f}: the loop is nearer to instability than is usual (1.4 to {USUAL_M_S:g})",
+            "tune with --ms 1.8 for more room",
+        )  # fmt: skip
+
+
 LOOKS_AT_THE_FILE: tuple[Callable[[Case], Iterator[Advice]], ...] = (
-    _integration, _sample_period, _sigma, _limits, _reach, _bounds, _angles,
+    _integration, _sample_period, _sigma, _limits, _reach, _margins, _bounds, _angles,
 )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tdof_npid_ros.advice import USUAL_M_S
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.simulate import (
@@ -237,9 +238,15 @@ def _summary(report: dict[str, Any], found: Margins) -> str:
             f"  setpoint: overshoot {setpoint['overshoot_percent']:.2f} %, IAE {setpoint['iae']:.4f}",
             f"  disturbance: peak {disturbance['peak']:.4f}, IAE {disturbance['iae']:.4f}",
             *(f"  {line}" for line in found.lines()),
+            *([f"  M_s is above {USUAL_M_S:g}: --ms 1.8 finds gains with more room"] if _is_near(found) else []),
             f"  {report['evaluations']} evaluations in {report['elapsed_s']:.1f} s, from {began}{ended}{saved}",
         ]
     )
+
+
+def _is_near(found: Margins) -> bool:
+    """Whether the loop is nearer to instability than is usual."""
+    return found.m_s is not None and found.m_s > 1.01 * USUAL_M_S
 
 
 def _compared(problem: TuningProblem, tuned: Gains) -> dict[str, Gains]:
