@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from tdof_npid_ros.graph.runtime.messages import stamp_ns
+from tdof_npid_ros.graph.runtime.messages import node_of, stamp_ns
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.runtime.parameter_client import RefusedError, RemoteNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
@@ -67,7 +67,7 @@ class Conductor:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._facts[status.name] = {pair.key: pair.value for pair in status.values}
+            self._facts[node_of(status)] = {pair.key: pair.value for pair in status.values}
 
     def _on_clock(self, message: Clock) -> None:
         self.time_ns = stamp_ns(message.clock)

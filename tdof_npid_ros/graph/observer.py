@@ -22,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.graph.runtime.messages import signal_message
+from tdof_npid_ros.graph.runtime.messages import node_of, signal_message
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
@@ -185,7 +185,7 @@ class LoopObserver:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         namespace = self.node.get_namespace().rstrip("/") + "/"
         for status in message.status:
-            name = status.name.partition(":")[0]
+            name = node_of(status)
             if name.startswith(namespace) and (short := name.removeprefix(namespace)) in NODES:
                 facts = {pair.key: pair.value for pair in status.values}
                 self.nodes[short] = NodeState(status.level[0], status.message, facts, time.monotonic())

@@ -358,7 +358,7 @@ class Graph:
         for status in message.status:
             facts = {pair.key: pair.value for pair in status.values}
             stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-            self.diagnostics[status.name] = {
+            self.diagnostics[status.name.removesuffix(": state")] = {
                 **facts, "level": status.level[0], "message": status.message, "stamp_ns": stamp_ns
             }  # fmt: skip
 

@@ -250,6 +250,16 @@ def test_a_held_controller_waits_for_its_supervisor(graph: Any) -> None:
     graph.publish_until(output, JointState(position=[0.0]), lambda: efforts, what="an effort")
 
 
+def test_a_node_s_diagnostics_are_called_as_the_custom_is(graph: Any) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    arrays = graph.collect("/diagnostics", DiagnosticArray)
+    graph.start("plant", namespace="/left")
+    graph.wait_until(lambda: arrays, 60, "diagnostics")
+    (status,) = arrays[-1].status
+    assert (status.name, status.hardware_id) == ("/left/plant: state", "/left/plant")
+
+
 def test_it_drives_the_joint_states_of_a_robot(graph: Any) -> None:
     from sensor_msgs.msg import JointState
 

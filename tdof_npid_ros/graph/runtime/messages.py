@@ -13,6 +13,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import SECOND
 
+TASK = "state"  # of a node, in its diagnostics
 NAMED_LANES = 8  # more are read by programs, which go by the place
 
 
@@ -56,15 +57,20 @@ def plan_from_message(message: JointTrajectory) -> Plan:
 
 
 def diagnostics_message(stamp: Time, name: str, level: int, text: str, facts: Mapping[str, object]) -> DiagnosticArray:
-    """One node's diagnostics."""
+    """One node's diagnostics, called `<node>: state` as is the custom; `name` is the node's full name."""
     status = DiagnosticStatus(
         level=bytes([level]),
-        name=name,
+        name=f"{name}: {TASK}",
         hardware_id=name,
         message=text,
         values=[KeyValue(key=key, value=str(value)) for key, value in facts.items()],
     )
     return DiagnosticArray(header=Header(stamp=stamp), status=[status])
+
+
+def node_of(status: DiagnosticStatus) -> str:
+    """The full name of the node whose diagnostics these are."""
+    return str(status.name).partition(":")[0]
 
 
 def lane_names(lanes: int) -> list[str]:

@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.graph.runtime.messages import node_of
 from tdof_npid_ros.graph.tuner.loop_client import LoopClient, WrongCaseError
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
@@ -176,4 +177,4 @@ class LoopPool:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._heard[status.name] = time.monotonic()
+            self._heard[node_of(status)] = time.monotonic()
