@@ -1,6 +1,9 @@
-"""Names of nodes, topics and services in their namespaces."""
+"""Names: of nodes, topics and services in their namespaces, and the one that a misspelt one stands for."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 def in_namespace(namespace: str, name: str = "") -> str:
@@ -20,3 +23,13 @@ def namespace_of(full_name: str) -> str:
     ('/left/', '/')
     """
     return f"{full_name.rpartition('/')[0]}/"
+
+
+def meant_hint(name: str, known: Iterable[str]) -> str:
+    """What to add to the message about a name that is not known; nothing if none of the known ones is like it.
+
+    >>> meant_hint("simulat", ["simulate", "tune"]), meant_hint("kpp", ["kp", "ki"]), meant_hint("xyz", ["kp"])
+    (': simulate is meant?', ': kp is meant?', '')
+    """
+    like = get_close_matches(name, known, 1)
+    return f": {like[0]} is meant?" if like else ""

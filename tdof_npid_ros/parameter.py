@@ -6,9 +6,9 @@ import math
 import numbers
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any, Final, NamedTuple
 
+from tdof_npid_ros.names import meant_hint
 from tdof_npid_ros.one_line import one_line
 
 LONGEST_SLIDER: Final = 1e6  # from end to end; of a longer one every point is too coarse
@@ -241,10 +241,9 @@ def unknown_parameters(given: Iterable[str], known: Collection[str], of_others: 
     warnings = []
     for name in given:
         if name not in known and name not in whole and not name.startswith(beginnings):
-            meant = get_close_matches(name, known, 1)
-            hint = f": {meant[0]} is meant?" if meant else ""
             warnings.append(
-                f"parameter {one_line(name, LONGEST_VALUE)} is not one of this node's, and does nothing{hint}"
+                f"parameter {one_line(name, LONGEST_VALUE)} is not one of this node's, and does nothing"
+                f"{meant_hint(name, known)}"
             )
     return warnings
 

@@ -9,6 +9,9 @@ import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
+from tdof_npid_ros import __version__
+from tdof_npid_ros.graph import NEEDS_ROS, ros_is_missing
+from tdof_npid_ros.names import meant_hint
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.streams import prepare_streams
 
@@ -64,13 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"tdof-npid {name}: {_message(error)}", file=sys.stderr)
         return USAGE_ERROR
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "rclpy":
+        if not ros_is_missing(error):
             raise
-        print(
-            f"tdof-npid {name}: needs ROS 2: source an installed one, or "
-            "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces",
-            file=sys.stderr,
-        )
+        print(f"tdof-npid {name}: {NEEDS_ROS}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
         print(f"tdof-npid {name}: interrupted", file=sys.stderr)
@@ -79,6 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: list[str], chosen: str) -> int:
     parser = _Parser(prog="tdof-npid", description="Nonlinear two-degree-of-freedom PID control loops.")
+    parser.add_argument("--version", action="version", version=f"tdof-npid {__version__}")
+    if given and not chosen and not given[0].startswith("-"):
+        parser.error(f"there is no subcommand {given[0]!r}{meant_hint(given[0], SUBCOMMANDS)}")
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")

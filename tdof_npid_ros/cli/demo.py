@@ -107,7 +107,7 @@ def _tune(result: Path, quiet: bool) -> None:
         print(f"Tuning {TUNED_TYPE} through a loop of plant, controller and tuner in {NAMESPACE} …", flush=True)
     with (
         _loop({"plant": {}, "controller": {}, "tuner": tuner}) as (conductor, processes),
-        tqdm(total=GENERATIONS, disable=quiet, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar,
+        tqdm(total=GENERATIONS, disable=quiet or None, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar,
     ):
 
         def finished() -> bool:
@@ -136,7 +136,7 @@ def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> Non
         conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
         episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
         with tqdm(
-            total=len(rounds) * sum(episode_s), disable=quiet, bar_format=_PLAYING_BAR, mininterval=_REDRAWN
+            total=len(rounds) * sum(episode_s), disable=quiet or None, bar_format=_PLAYING_BAR, mininterval=_REDRAWN
         ) as bar:
             for round_, (name, gains) in enumerate(rounds.items()):
                 bar.set_description(f"{name:17}")

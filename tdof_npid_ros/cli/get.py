@@ -24,11 +24,8 @@ def run(arguments: argparse.Namespace) -> int:
             found = client.diagnostics()
         else:
             remote = client.remote(arguments.node)
-            names = arguments.names or sorted(remote.parameter_names())
-            found = remote.parameters(names)
-            missing = [name for name in arguments.names if found[name] is None]
-            if missing:
-                raise ValueError(f"{arguments.node} has no parameter {', '.join(missing)}, or one of them is not set")
+            client.check_names(arguments.node, arguments.names)
+            found = remote.parameters(arguments.names or sorted(remote.parameter_names()))
     if arguments.json:
         print(json.dumps(found, default=str))
     else:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+from tdof_npid_ros.names import meant_hint
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.observer import LoopObserver
@@ -34,8 +36,25 @@ class LoopClient:
         return self._observer.remote(node)
 
     def set_parameters(self, node: str, values: dict[str, Any]) -> None:
-        """Set parameters together."""
+        """Set parameters together.
+
+        Raises:
+            ValueError: the node does not have one of them.
+            RuntimeError: it refuses them, or does not answer.
+        """
+        self.check_names(node, values)
         self.remote(node).set_parameters(values)
+
+    def check_names(self, node: str, names: Iterable[str]) -> None:
+        """Make sure that a node has these parameters.
+
+        Raises:
+            ValueError: it does not; the message names the one that is meant.
+        """
+        known = self.remote(node).parameter_names()
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{node} has no parameter {name}{meant_hint(name, known)}")
 
     def publish(self, topic: str, value: float) -> None:
         """Publish a value once somebody hears it.

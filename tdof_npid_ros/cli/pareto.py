@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     fronts: list[Front] = []
     constraints = constraints_of(arguments)
     searches = [(ratio, controller) for ratio in ratios for controller in controllers]
-    with tqdm(total=len(searches) * arguments.generations, unit="generation", leave=False) as bar:
+    with tqdm(total=len(searches) * arguments.generations, unit="generation", leave=False, disable=None) as bar:
         for ratio, controller in searches:
             bar.set_description(f"L/T = {ratio:g}, {controller}")
             fronts.append(

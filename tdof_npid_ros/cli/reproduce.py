@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     only = [] if arguments.only is None else [name.strip().lower() for name in arguments.only.split(",")]
     reproduction = Reproduction(only, Effort(seeds=arguments.seeds))
     claim_folder(arguments.out, SUBCOMMAND)
-    with tqdm(total=len(reproduction.jobs(arguments.out)), unit="job", leave=False) as bar:
+    with tqdm(total=len(reproduction.jobs(arguments.out)), unit="job", leave=False, disable=None) as bar:
         summary = reproduce(arguments.out, reproduction, lambda label: _show(bar, label))
     if arguments.json:
         print(json.dumps(summary))

@@ -59,7 +59,7 @@ def _play(loop: RunningLoop, seconds: float | None, quiet: bool) -> bool:
     deadline = None if seconds is None else time.monotonic() + seconds
     loop.play()
     first = loop.conductor.label.number if loop.conductor.label else 1
-    with tqdm(total=sum(ends), disable=None if not quiet else True, bar_format=BAR, mininterval=REDRAWN) as bar:
+    with tqdm(total=sum(ends), disable=quiet or None, bar_format=BAR, mininterval=REDRAWN) as bar:
         while loop.is_playing:
             if deadline is not None and time.monotonic() > deadline:
                 return False

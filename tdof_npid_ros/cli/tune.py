@@ -201,7 +201,9 @@ def _interrupt_requested() -> Iterator[Callable[[], bool]]:
 def _progress(study: Study, shown: bool) -> Iterator[Callable[[Study], None]]:
     from tqdm import tqdm
 
-    with tqdm(total=study.budget, initial=study.evaluations, unit=" evaluations", disable=not shown) as bar:
+    with tqdm(
+        total=study.budget, initial=study.evaluations, unit=" evaluations", disable=None if shown else True
+    ) as bar:
 
         def show(study: Study) -> None:
             bar.set_description(f"generation {study.generation}, {study.best_told}", refresh=False)

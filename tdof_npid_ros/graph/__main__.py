@@ -14,6 +14,7 @@ import signal
 import sys
 from types import FrameType
 
+from tdof_npid_ros.graph import NEEDS_ROS, ros_is_missing
 from tdof_npid_ros.reference import node_help
 from tdof_npid_ros.streams import prepare_streams
 
@@ -50,7 +51,14 @@ def run(node: str, arguments: list[str]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
     end_with_parent()
-    importlib.import_module(f"tdof_npid_ros.graph.{MODULES[node]}").main(arguments)
+    try:
+        module = importlib.import_module(f"tdof_npid_ros.graph.{MODULES[node]}")
+    except ModuleNotFoundError as error:
+        if not ros_is_missing(error):
+            raise
+        print(f"{node}: {NEEDS_ROS}", file=sys.stderr)
+        sys.exit(2)
+    module.main(arguments)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

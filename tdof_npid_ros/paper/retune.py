@@ -70,7 +70,7 @@ def main() -> int:
         Job(row.case, row.controller, level, SEEDS[:1], ROBUST_GENERATIONS) for level in robust.LEVELS for row in ROWS
     ]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
-        rows = list(tqdm(pool.map(tuned_row, free + held), total=len(free) + len(held), unit=" row"))
+        rows = list(tqdm(pool.map(tuned_row, free + held), total=len(free) + len(held), unit=" row", disable=None))
     _write(FILE, rows[: len(free)])
     _write(robust.FILE, _nested([row for row in rows[len(free) :] if row is not None]))
     return 0

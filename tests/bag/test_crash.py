@@ -18,8 +18,8 @@ from tdof_npid_ros.bag.recover import recover
 from tdof_npid_ros.bag.schema import definition
 from tdof_npid_ros.cli import main
 
-KILLS = budget("TDOF_NPID_KILLS", 20)  # issue 5 asks for 200 once
-TRUNCATIONS = -(-budget("TDOF_NPID_TRUNCATIONS", 300) // 3)  # for each compression; issue 5 asks for 2000 in all once
+KILLS = budget("TDOF_NPID_KILLS", 20)  # 200 in the long form
+TRUNCATIONS = -(-budget("TDOF_NPID_TRUNCATIONS", 300) // 3)  # for each compression; 2000 in all in the long form
 SECOND_NS = 10**9
 AT_ONCE = 4
 

@@ -108,6 +108,14 @@ def opened(page: Any, url: str) -> None:
     page.wait_for_function("Bokeh.documents[0].get_model_by_name('kp_field').value !== null", timeout=60_000)
 
 
+@pytest.mark.parametrize("asked", [("set", "kpp=5"), ("get", "kpp")])
+def test_a_misspelt_parameter_is_told_of_with_the_one_that_is_meant(program: Program, asked: tuple[str, str]) -> None:
+    command = [sys.executable, "-m", "tdof_npid_ros", *asked, "--namespace", "/live"]
+    done = subprocess.run(command, env=program.environment, capture_output=True, text=True, timeout=60)
+    said = f"tdof-npid {asked[0]}: controller has no parameter kpp: kp is meant?\n"
+    assert (done.returncode, done.stderr) == (2, said)
+
+
 @needs_chromium
 def test_the_page_sees_and_steers_the_loop(program: Program) -> None:
     assert CHROMIUM

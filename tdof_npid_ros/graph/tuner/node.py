@@ -184,7 +184,7 @@ class TunerNode(LoopNode):
                 total=self.study.budget,
                 initial=self.study.evaluations,
                 unit=" evaluations",
-                disable=not sys.stderr.isatty(),
+                disable=None,
             ) as self.bar:
                 self.study.run(self.evaluator.evaluate, self._after_generation)
             if self.study.done and self.study.feasible and self.step_test is None:
