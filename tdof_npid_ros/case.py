@@ -205,7 +205,7 @@ def load_case(name: str | Path) -> Case:
     path = find_parameter_file(name)
     nodes = {node: read_parameters(path, node) for node in _OF_CASE}
     try:
-        return _case_of(path.stem, nodes, path.parent)
+        return _case_of(path.stem, nodes, path.parent, str(path))
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
 
@@ -243,14 +243,20 @@ def make_case(
     scenario = {"episodes": list(episodes)} | {f"plan.{one}": list(lines) for one, lines in episodes.items()}
     given = (plant, controller, scenario, tuner or {})
     common = {"sample_period": sample_period}
-    return _case_of(name, {node: {**common, **values} for node, values in zip(_OF_CASE, given, strict=True)}, None)
+    nodes = {node: {**common, **values} for node, values in zip(_OF_CASE, given, strict=True)}
+    return _case_of(name, nodes, None, name)
 
 
 _OF_CASE = ("plant", "controller", "scenario", "tuner")  # the nodes whose parameters make a case
 
 
-def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | None) -> Case:
-    """The case that nodes with these parameters are; `folder` is where a plant's class may lie, too."""
+def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | None, told_as: str) -> Case:
+    """The case that nodes with these parameters are.
+
+    Args:
+        folder: where a plant's class may lie, too.
+        told_as: what warnings call it: its file, if there is one.
+    """
     model = named_model(nodes["plant"].get("model", PLANT["model"].default), folder)
     tables: dict[str, Table] = {**NODES, "plant": {**PLANT, **model_table(model)}}
     plant, controller, scenario, tuner = (_checked(nodes[node], tables[node]) for node in _OF_CASE)
@@ -279,7 +285,7 @@ def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | N
     case = _with_scale(case, "sigma" in controller)
     for node, values in nodes.items():
         for warning in misspelt(values, tables[node]):
-            warnings.warn(f"{name}: {node}: {warning}", stacklevel=3)
+            warnings.warn(f"{told_as}: {node}: {warning}", stacklevel=3)
     return case
 
 

@@ -111,6 +111,7 @@ def opened(page: Any, url: str) -> None:
 @pytest.mark.parametrize("asked", [("set", "kpp=5"), ("get", "kpp")])
 def test_a_misspelt_parameter_is_told_of_with_the_one_that_is_meant(program: Program, asked: tuple[str, str]) -> None:
     command = [sys.executable, "-m", "tdof_npid_ros", *asked, "--namespace", "/live"]
+    eventually(lambda: "controller" in program.tdof_npid("get", "--diagnostics"), "the controller is there")
     done = subprocess.run(command, env=program.environment, capture_output=True, text=True, timeout=60)
     said = f"tdof-npid {asked[0]}: controller has no parameter kpp: kp is meant?\n"
     assert (done.returncode, done.stderr) == (2, said)
