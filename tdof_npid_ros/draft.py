@@ -323,8 +323,8 @@ def rounded_up(value: float) -> float:
 
 
 def significant(value: float, digits: int = 4) -> float:
-    """A number to so many digits."""
-    return float(f"{value:.{digits}g}")
+    """A number to so many digits; 0 has no sign."""
+    return float(f"{value:.{digits}g}") + 0.0
 
 
 def _yaml(value: Any) -> str:

@@ -16,6 +16,15 @@ CONFIRMED_FRACTION = 0.05  # of the response, at its end: it is settled once it 
 NO_BAND = f"no setpoint step is known that the {100 * RECOVERY_BAND:g} % band would be a fraction of"
 
 
+def in_units(value: float) -> str:
+    """A metric that bears a unit, for people: four decimals, or four digits where the unit is too large or too small.
+
+    >>> in_units(33.39061), in_units(2e-8), in_units(1.25e9), in_units(0.0)
+    ('33.3906', '2e-08', '1.25e+09', '0.0000')
+    """
+    return f"{value:.4f}" if value == 0.0 or 1e-3 <= abs(value) < 1e6 else f"{value:.4g}"
+
+
 @dataclass(frozen=True)
 class SetpointMetrics:
     """A response to a setpoint step; times from the step on. `None` where there is no such time, with the reason."""

@@ -43,6 +43,12 @@ def test_a_new_file_is_taken_by_every_command_and_reaches_its_setpoint(
     assert all(low < high for low, high in case.bounds.values())
 
 
+def test_a_gain_of_nothing_has_no_sign(tmp_path: Path) -> None:
+    path = tmp_path / "cooler.yaml"
+    assert main(["new", str(path), "--gain", "-0.3", "--time-constant", "60", "--dead-time", "5", "--step", "-10"]) == 0
+    assert "kd: 0.0\n" in path.read_text()
+
+
 def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text("mine")

@@ -6,10 +6,10 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from tdof_npid_ros.analysis import page, picture
 from tdof_npid_ros.analysis.effort import Deviation, EffortUse, deviation, effort_use
@@ -17,7 +17,7 @@ from tdof_npid_ros.analysis.episodes import Episode, bag_names, episodes_in
 from tdof_npid_ros.analysis.loop_margins import episode_margins
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics
+from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, in_units
 from tdof_npid_ros.parameters import NOISE, PLANT
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
@@ -25,26 +25,27 @@ from tdof_npid_ros.stability.margins import Margins
 
 LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
 # Column of the table and of the CSV: title, and how a person reads a value.
-COLUMNS = {
-    "bag": ("bag", "{}"),
-    "episode": ("episode", "{}"),
-    "controller": ("controller", "{}"),
-    "lane": ("lane", "{}"),
-    "joint": ("joint", "{}"),
-    "response": ("response to", "{}"),
-    "start_s": ("at (s)", "{:g}"),
-    "overshoot_percent": ("M_p (%)", "{:.4f}"),
-    "settling_time_s": ("t_s (s)", "{:.4f}"),
-    "peak": ("M_peak", "{:.4f}"),
-    "recovery_time_s": ("t_rcy (s)", "{:.4f}"),
-    "iae": ("IAE", "{:.4f}"),
-    "iae_change_percent": ("ΔIAE (%)", "{:+.1f}"),
-    "effort_variation": ("Σ|Δu|", "{:.4g}"),
-    "effort_peak": ("max|u|", "{:.4g}"),
-    "saturated_percent": ("at limit (%)", "{:.1f}"),
-    "deviation": ("off simulation", "{:.3g}"),
-    "m_s": ("M_s", "{:.2f}"),
+COLUMNS: Final[dict[str, tuple[str, Callable[[Any], str]]]] = {
+    "bag": ("bag", "{}".format),
+    "episode": ("episode", "{}".format),
+    "controller": ("controller", "{}".format),
+    "lane": ("lane", "{}".format),
+    "joint": ("joint", "{}".format),
+    "response": ("response to", "{}".format),
+    "start_s": ("at (s)", "{:g}".format),
+    "overshoot_percent": ("M_p (%)", "{:.4f}".format),
+    "settling_time_s": ("t_s (s)", in_units),
+    "peak": ("M_peak", in_units),
+    "recovery_time_s": ("t_rcy (s)", in_units),
+    "iae": ("IAE", in_units),
+    "iae_change_percent": ("ΔIAE (%)", "{:+.1f}".format),
+    "effort_variation": ("Σ|Δu|", "{:.4g}".format),
+    "effort_peak": ("max|u|", "{:.4g}".format),
+    "saturated_percent": ("at limit (%)", "{:.1f}".format),
+    "deviation": ("off simulation", "{:.3g}".format),
+    "m_s": ("M_s", "{:.2f}".format),
 }
+WHICH_ROW = ("bag", "episode", "lane", "joint", "start_s")  # what tells one row from another
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,14 @@ class Report:
                 first.setdefault(same, row["iae"])
         return rows
 
-    def table(self) -> str:
-        """The rows as a table for a terminal; columns without a value are left out."""
+    def table(self, width: int | None = None) -> str:
+        """The rows as a table for a terminal; columns without a value are left out.
+
+        Args:
+            width: of the terminal: a wider table goes on below, with what says which row it is; None: it may be wide.
+        """
         cells, left_out = self._cells()
-        widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
-        lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
-        lines.insert(1, "  ".join("─" * width for width in widths))
+        lines = [line for part in _parts(cells, width) for line in _lines(part)]
         if left_out:
             lines.append(f"… {left_out} rows of further lanes: --csv or --json has them")
         return "\n".join([*lines, *self.notes()])
@@ -264,8 +267,28 @@ def _rows(report: EpisodeReport, bag: str) -> list[dict[str, Any]]:
     return rows
 
 
+def _parts(cells: list[list[str]], width: int | None) -> list[list[list[str]]]:
+    """A table, or its columns in tables that fit, each after the columns that say which row it is."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    titles = [COLUMNS[name][0] for name in WHICH_ROW]
+    first = [i for i, title in enumerate(cells[0]) if title in titles]
+    parts: list[list[int]] = [[]]
+    for i in (i for i in range(len(widths)) if i not in first):
+        if width is not None and parts[-1] and sum(widths[j] + 2 for j in (*first, *parts[-1], i)) - 2 > width:
+            parts.append([])
+        parts[-1].append(i)
+    return [[[line[i] for i in sorted((*first, *part))] for line in cells] for part in parts]
+
+
+def _lines(cells: list[list[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+    lines.insert(1, "  ".join("─" * width for width in widths))
+    return lines
+
+
 def _shown(row: dict[str, Any], name: str) -> str:
-    return "-" if row[name] is None else COLUMNS[name][1].format(row[name])
+    return "-" if row[name] is None else COLUMNS[name][1](row[name])
 
 
 def _as_json(report: EpisodeReport, iae_changes: Iterator[float | None]) -> dict[str, Any]:

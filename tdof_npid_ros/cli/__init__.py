@@ -50,6 +50,11 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         self.exit(USAGE_ERROR, f"{self.prog}: {one_line(message)}: see {self.prog} --help\n")
 
+    def refuse(self, arguments: Sequence[str]) -> NoReturn:
+        """Say that these are no arguments here, and which option is meant."""
+        hints = [meant_hint(one.partition("=")[0], self._option_string_actions) for one in arguments if one[:1] == "-"]
+        self.error(f"unrecognized arguments: {' '.join(arguments)}{next(filter(None, hints), '')}")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit status: 0 only on success, 2 for bad input."""
@@ -81,13 +86,17 @@ def _run(given: list[str], chosen: str) -> int:
     parser.add_argument("--version", action="version", version=f"tdof-npid {__version__}")
     if given and not chosen and not given[0].startswith("-"):
         parser.error(f"there is no subcommand {given[0]!r}{meant_hint(given[0], SUBCOMMANDS)}")
+    parser_of_chosen = parser
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
     for name, text in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         subparser.add_argument("--json", action="store_true", help="print one JSON object, for scripts")
         if name == chosen:
+            parser_of_chosen = subparser
             importlib.import_module(f"{__name__}.{name}").add_arguments(subparser)
-    parsed = parser.parse_args(given)
+    parsed, strange = parser.parse_known_args(given)
+    if strange:
+        parser_of_chosen.refuse(strange)
     return int(importlib.import_module(f"{__name__}.{parsed.subcommand}").run(parsed))
 
 

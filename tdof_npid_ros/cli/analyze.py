@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import sys
 from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
@@ -45,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(report.as_json(), allow_nan=False))
         return 0
-    print(report.table())
+    print(report.table(shutil.get_terminal_size().columns if sys.stdout.isatty() else None))
     for path in written:
         print(f"written: {path}")
     return 0

@@ -169,14 +169,19 @@ _PLAYING_BAR = "{desc} |{bar:30}| {n:.0f}/{total:.0f} simulated s [{elapsed}]"
 
 def _comparison(report: Any, rounds: list[str], episodes: int) -> str:
     """The paper's metrics of each round, measured from the bag, beside the published ones."""
-    lines = ["", f"{'measured (published)':21}" + "".join(f"{name:>20}" for name in METRICS)]
-    for i, name in enumerate(rounds):
-        measured = {one.episode.name: one.metrics() for one in report.episodes[i * episodes : (i + 1) * episodes]}
-        row = published(CASE, controller_type(name)) if name in COMPARED else None
-        lines.append(f"{name:21}" + "".join(_cell(measured, row, *METRICS[metric]) for metric in METRICS))
-    lines.append(
-        "This case does not come out exactly under the paper's stated conventions: docs/reproduction.md says why."
-    )
+    lines = []
+    for kind in dict.fromkeys(episode for episode, _, _ in METRICS.values()):  # a table each: in 80 columns
+        names = [name for name, (episode, _, _) in METRICS.items() if episode == kind]
+        lines += ["", f"{'measured (published)':21}" + "".join(f"{name:>19}" for name in names)]
+        for i, name in enumerate(rounds):
+            measured = {one.episode.name: one.metrics() for one in report.episodes[i * episodes : (i + 1) * episodes]}
+            row = published(CASE, controller_type(name)) if name in COMPARED else None
+            lines.append(f"{name:21}" + "".join(_cell(measured, row, *METRICS[metric]) for metric in names))
+    lines += [
+        "",
+        "This case does not come out exactly under the paper's stated conventions:",
+        "docs/reproduction.md says why.",
+    ]
     return "\n".join([*lines, *report.notes(), ""])
 
 
@@ -194,4 +199,4 @@ METRICS = {
 def _cell(measured: dict[str, Any], row: Any, episode: str, ours: str, theirs: str) -> str:
     value = getattr(measured.get(episode), ours, None)
     shown = "-" if value is None else f"{value:.4g}"
-    return f"{shown if row is None else f'{shown} ({getattr(row, theirs):.4g})':>20}"
+    return f"{shown if row is None else f'{shown} ({getattr(row, theirs):.4g})':>19}"

@@ -96,7 +96,10 @@ def _draft(arguments: argparse.Namespace) -> Draft:
             "MODULE:CLASS, and --step is the largest change of the setpoint"
         )
     if arguments.model is not None and (arguments.gain is not None or arguments.time_constant):
-        raise ParameterFileError("--model is a class of your own: --gain and --time-constant do not go with it")
+        raise ParameterFileError(
+            "--model is a class of your own: --gain and --time-constant do not go with it "
+            "(an integrating plant is --gain K --integrating)"
+        )
     common: dict[str, Any] = {
         "step": arguments.step,
         "effort": tuple(arguments.effort or (-math.inf, math.inf)),

@@ -19,6 +19,7 @@ from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, 
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
 from tdof_npid_ros.interactive import Page, response_plots
 from tdof_npid_ros.loop import Trajectory
+from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.plotting import Curve, Panel, draw_responses
@@ -97,7 +98,7 @@ def _page(case: Case, of: Mapping[str, Gains], panels: Sequence[Panel]) -> Page:
         [
             ["", *(f"{episode}: {name.replace('_', ' ')}" for episode, name in metrics)],
             *(
-                [label, *("-" if (v := report[e][n]) is None else _number(v) for e, n in metrics)]
+                [label, *("-" if (v := report[e][n]) is None else _shown(n, v) for e, n in metrics)]
                 for label, report in reports.items()
             ),
         ]
@@ -148,10 +149,11 @@ def _table(report: dict[str, Any]) -> list[str]:
     lines = []
     for episode in ("setpoint", "disturbance"):
         for name, value in report[episode].items():
-            shown = value if isinstance(value, str) else "-" if value is None else _number(value)
+            shown = value if isinstance(value, str) else "-" if value is None else _shown(name, value)
             lines.append(f"  {episode:12} {name:18} {shown}")
-    return [*lines, f"  objective {_number(report['objective'])}"]
+    return [*lines, f"  objective {in_units(report['objective'])}"]
 
 
-def _number(value: float) -> str:
-    return f"{value:.4f}" if abs(value) < 1e6 else f"{value:.3g}"  # a loop that diverges
+def _shown(name: str, value: float) -> str:
+    """A metric for people; a share needs no digits below the table's."""
+    return f"{value:.4f}" if name.endswith("_percent") and abs(value) < 1e6 else in_units(value)

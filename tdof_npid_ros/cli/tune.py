@@ -29,6 +29,7 @@ from tdof_npid_ros.cli.simulate import (
     write_responses,
 )
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, controller_type
+from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, find_parameter_file, write_parameters
 from tdof_npid_ros.parameters import TUNER
@@ -237,8 +238,8 @@ def _summary(report: dict[str, Any], found: Margins) -> str:
         [
             f"{report['case']}  {report['controller']}: objective {report['objective']:.6g}, {was}",
             *gains,
-            f"  setpoint: overshoot {setpoint['overshoot_percent']:.2f} %, IAE {setpoint['iae']:.4f}",
-            f"  disturbance: peak {disturbance['peak']:.4f}, IAE {disturbance['iae']:.4f}",
+            f"  setpoint: overshoot {setpoint['overshoot_percent']:.2f} %, IAE {in_units(setpoint['iae'])}",
+            f"  disturbance: peak {in_units(disturbance['peak'])}, IAE {in_units(disturbance['iae'])}",
             *(f"  {line}" for line in found.lines()),
             *([f"  M_s is above {USUAL_M_S:g}: --ms 1.8 finds gains with more room"] if _is_near(found) else []),
             f"  {report['evaluations']} evaluations in {report['elapsed_s']:.1f} s, from {began}{ended}{saved}",

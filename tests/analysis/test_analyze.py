@@ -106,6 +106,20 @@ def test_a_ramp_has_its_error_only(tmp_path, case) -> None:
     assert response.kind == "tracking" and response.metrics is None and response.iae > 0
 
 
+def test_a_table_fits_the_terminal_and_loses_nothing(tmp_path, case) -> None:
+    with LoopBag(tmp_path / "bag") as writer:
+        writer.configuration(case, case.gains)
+        writer.episode(case, case.gains, "setpoint", 1)
+        writer.episode(case, case.gains, "disturbance", 2)
+    report = analyze([tmp_path / "bag"])
+    wide, narrow = report.table().splitlines(), report.table(80).splitlines()
+    assert max(map(len, wide)) > 80 >= max(map(len, narrow))
+    assert {word for line in wide[:4] for word in line.split()} - {
+        word for line in narrow for word in line.split()
+    } <= {word for word in wide[1].split()}
+    assert len([line for line in narrow if line.startswith("setpoint #1")]) == len(narrow) // 4
+
+
 def test_outputs_that_are_missing_are_said_to_be(tmp_path, case) -> None:
     with LoopBag(tmp_path / "bag") as writer:
         writer.configuration(case, case.gains)

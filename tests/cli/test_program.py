@@ -39,6 +39,16 @@ def test_the_subcommand_that_is_meant_is_named(given: str, said: str, capsys: py
     assert capsys.readouterr().err == f"tdof-npid: {said}\n"
 
 
+def test_an_argument_that_a_subcommand_does_not_have_is_told_with_the_one_that_is_meant(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["simulate", "p1-c4", "--plto", "x.png"])
+    assert ended.value.code == 2
+    said = "tdof-npid simulate: unrecognized arguments: --plto x.png: --plot is meant?: see tdof-npid simulate --help\n"
+    assert capsys.readouterr().err == said
+
+
 @pytest.mark.parametrize("node", ["controller", "plant", "tuner", "recorder"])
 def test_a_node_without_ros_names_the_remedy(node: str) -> None:
     code = (

@@ -268,3 +268,18 @@ def test_different_sample_periods_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(ParameterFileError, match=r"sample_period is 0\.01 in plant and 0\.05 in controller"):
         load_case(file)
+
+
+def test_no_metric_is_hidden_by_the_plants_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a plant in nanometres, told in metres, and of one that settles within microseconds."""
+    slow, fast = str(tmp_path / "slow.yaml"), str(tmp_path / "fast.yaml")
+    assert main(["new", slow, "--gain", "1e-9", "--time-constant", "60", "--dead-time", "10", "--step", "2e-8"]) == 0
+    assert main(["new", fast, "--gain", "1e6", "--time-constant", "1e-4", "--step", "1e6"]) == 0
+    capsys.readouterr()
+    for file in (slow, fast):
+        report = simulated(capsys, file)
+        assert main(["simulate", file]) == 0
+        printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+        for episode, name in (("setpoint", "iae"), ("setpoint", "settling_time_s"), ("disturbance", "peak")):
+            (value,) = [float(line[2]) for line in printed if line[:2] == [episode, name]]
+            assert value == pytest.approx(report[episode][name], rel=1e-3)
