@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tdof_npid_ros.live.page import LivePage
     from tdof_npid_ros.live.server import LiveServer
     from tdof_npid_ros.live.steering import Steering
-    from tdof_npid_ros.parameter_file import find_parameter_file
+    from tdof_npid_ros.parameter_file import find_parameter_file, read_parameters
 
     case = None if arguments.case is None else load_case(arguments.case)
     if case is not None:
@@ -57,7 +57,11 @@ def run(arguments: argparse.Namespace) -> int:
             path = find_parameter_file(arguments.case)
             processes = stack.enter_context(NodeProcesses(path, namespace))
             common: dict[str, Any] = {"mode": arguments.mode, "speed": arguments.speed}
-            start_nodes(processes, case, path, arguments.bag, common, play=arguments.mode == "lockstep")
+            plays = arguments.mode == "lockstep"
+            # Until somebody steps the setpoint, the loop stays where the plant begins.
+            stays = not plays and "setpoint" not in read_parameters(path, "controller")
+            setpoint = {"setpoint": case.plant.initial_output} if stays else {}
+            start_nodes(processes, case, path, arguments.bag, common, play=plays, controller=setpoint)
         observer = LoopObserver(namespace)
         stack.callback(observer.close)
         steering = Steering(observer, case)

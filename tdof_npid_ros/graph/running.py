@@ -160,6 +160,7 @@ def start_nodes(
     *,
     play: bool,
     nodes: Sequence[str] = NODES,
+    controller: Mapping[str, Any] | None = None,
 ) -> None:
     """Start a case's nodes, the recorder first.
 
@@ -168,6 +169,7 @@ def start_nodes(
         bag: a new folder to record to; None: nothing is recorded.
         common: parameters for all nodes, after those of the file.
         play: whether the scenario plays at once.
+        controller: further parameters for the controller.
 
     Raises:
         OutputError: the bag is there already.
@@ -178,7 +180,7 @@ def start_nodes(
     lossless = {"lossless": bag is not None and mode == "lockstep"}
     own: dict[str, dict[str, Any]] = {
         "plant": dict(lossless),
-        "controller": {"sigma": case.gains.sigma},
+        "controller": {"sigma": case.gains.sigma, **(controller or {})},
         "scenario": {"play": play},
     }
     if bag is not None:

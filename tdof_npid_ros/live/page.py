@@ -34,7 +34,7 @@ from tdof_npid_ros.plotting import GUIDE, PALETTE
 
 REFRESH_MS = 50  # plots
 LOOK_MS = 500  # numbers, widgets and diagnostics
-WINDOW = 20.0  # s that scroll by, at first
+WINDOW = 20.0  # s that scroll by, at first, of a loop of which no case is known
 ROLLOVER = 4000  # points of a curve that a browser holds
 MOST_AT_ONCE = 400  # points that one refresh sends; a faster loop is thinned
 DECADES = 2.0  # of a slider to either side of a gain that has no bounds
@@ -160,7 +160,7 @@ class LivePage:
             finish_legend(plot)
         for plot in (effort, terms):
             plot.toolbar_location = None
-        output.x_range.follow, output.x_range.follow_interval, output.x_range.range_padding = "end", WINDOW, 0.0
+        output.x_range.follow, output.x_range.follow_interval, output.x_range.range_padding = "end", self._window(), 0.0
         self._plots = column(output, effort, terms, step, name="plots", sizing_mode="stretch_width")
 
     # Controls
@@ -191,8 +191,10 @@ class LivePage:
         redo.on_click(steering.redo)
         keep.on_click(self._keep)
         rows += [row(undo, redo, keep), self._kept]
-        self._setpoint = NumericInput(title="setpoint", value=0.0, mode="float", width=110, name="setpoint_field")
-        self._size = NumericInput(title="step by", value=1.0, mode="float", width=110, name="size")
+        begins = 0.0 if self._case is None else self._case.plant.initial_output
+        size = 1.0 if self._case is None else self._case.largest_step or 1.0
+        self._setpoint = NumericInput(title="setpoint", value=begins, mode="float", width=110, name="setpoint_field")
+        self._size = NumericInput(title="step by", value=size, mode="float", width=110, name="size")
         up, down = Button(label="step up", name="step_up"), Button(label="step down", name="step_down")
         self._setpoint.on_change("value", _given(steering.setpoint))
         up.on_click(lambda: self._step(1.0))
@@ -266,6 +268,13 @@ class LivePage:
         if active and rows:
             values["manual_effort"] = float(rows[-1].effort[self._lane])  # from where the effort is
         self._ask(values)
+
+    def _window(self) -> float:
+        """How many seconds scroll by: an episode, or as much of it as a browser holds."""
+        if self._case is None or not self._case.plans:
+            return WINDOW
+        shortest = min(plan.end_ns for plan in self._case.plans.values()) / 1e9
+        return min(shortest, ROLLOVER * self._case.sample_period)
 
     def _step(self, sign: float) -> None:
         rows, _ = self._observer.rows_since(self._observer.count - 1)

@@ -118,6 +118,27 @@ def test_a_misspelt_parameter_is_told_of_with_the_one_that_is_meant(program: Pro
 
 
 @needs_chromium
+def test_a_loop_begins_where_its_plant_rests_and_steps_by_its_own_step(tmp_path: Path) -> None:
+    facts = ["--gain", "0.8", "--time-constant", "180", "--effort", "0", "100", "--at", "20", "--step", "40"]
+    new = [sys.executable, "-m", "tdof_npid_ros", "new", "heater.yaml", *facts]
+    assert subprocess.run(new, cwd=tmp_path, timeout=100).returncode == 0
+    program = Program(tmp_path, "heater.yaml", "--speed", "20")
+    try:
+        assert CHROMIUM
+        with chromium_page(CHROMIUM, width=1280) as page:
+            opened(page, program.url)
+            assert (model(page, "setpoint_field", "w.value"), model(page, "size", "w.value")) == (20.0, 40.0)
+            assert program.tdof_npid("get", "setpoint")["setpoint"] == 20.0
+            page.get_by_role("button", name="step up").click()
+            numbers = lambda: str(model(page, "numbers", "w.text"))  # noqa: E731
+            eventually(
+                lambda: model(page, "setpoint_field", "w.value") == 60.0 and "overshoot 0.0 %" in numbers(), numbers
+            )
+    finally:
+        program.stop()
+
+
+@needs_chromium
 def test_the_page_sees_and_steers_the_loop(program: Program) -> None:
     assert CHROMIUM
     with chromium_page(CHROMIUM, width=1280) as page:
