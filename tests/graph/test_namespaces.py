@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,11 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-EPISODES = {"setpoint": ("0 setpoint 1", "0.6 end"), "disturbance": ("0 disturbance 1", "0.6 end")}
-STEPS = 120  # of each episode
+END, PERIOD = (
+    16.0,
+    0.05,
+)  # s, of each episode, which comes to rest in it, and of the samples: few steps on a slow network
+STEPS = round(END / PERIOD)  # of each episode
 RUN = {"population": 4, "generations": 10, "polish": 4, "seed": 9}
 LOSS = 5  # per cent of the packets, each way
 TIMEOUT = 100.0  # s
@@ -139,8 +141,8 @@ def test_two_loops_on_two_hosts_with_lost_packets_give_the_offline_result(
 ) -> None:
     case = tmp_path / "case.yaml"
     text = (REPOSITORY / "config" / "p1-c0.5.yaml").read_text()
-    case.write_text(text.replace("25 end", "0.6 end"))
-    which = TuningProblem(replace(load_case("p1-c0.5"), episodes=EPISODES), "tdof_npid2", **RUN)  # type: ignore[arg-type]
+    case.write_text(text.replace("25 end", f"{END} end").replace("sample_period: 0.005", f"sample_period: {PERIOD}"))
+    which = TuningProblem(load_case(case), "tdof_npid2", warm=True, **RUN)  # type: ignore[arg-type]
     study = Study(which)
     study.run(Objective(which))
 

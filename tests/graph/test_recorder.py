@@ -129,7 +129,9 @@ def test_a_type_that_is_not_installed_is_left_out(graph: Any, tmp_path: Path) ->
     graph.environment["PYTHONPATH"] = f"{tmp_path / 'hidden'}{os.pathsep}{graph.environment['PYTHONPATH']}"
     recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
     graph.node.create_publisher(Marker, "marker", 1)
-    graph.wait_for_log(recorder, "/marker is not recorded: the message type visualization_msgs/msg/Marker", 60)
+    graph.wait_for_log(
+        recorder, "/marker is not recorded: the Python package visualization_msgs is not the one installed", 60
+    )
     graph.publisher("temperature", Float64).publish(Float64(data=20.0))
     before = int(graph.fact("/recorder", "recorded", 0))
     graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > before, 20, "the other topic")

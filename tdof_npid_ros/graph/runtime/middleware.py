@@ -29,7 +29,7 @@ def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
     environment.setdefault(RANGE, "LOCALHOST")
     profile = config_folder() / "fastdds_loopback.xml"
     is_fast_dds = environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
-    is_ours = environment.get(PROFILE, str(profile)) == str(profile)
+    is_ours = environment.get(PROFILE, str(profile)) in (str(profile), str(config_folder() / "fastdds.xml"))
     if environment[RANGE] == "LOCALHOST" and is_fast_dds and is_ours and profile.is_file():
         environment[PROFILE] = str(profile)
         environment[RANGE] = "SYSTEM_DEFAULT"
