@@ -59,17 +59,26 @@ def draft_of(found: Identified, records: Sequence[Record], title: str) -> Draft:
         f"{found.fit_percent:.1f} % fit on data not used; noise {found.noise:.3g} (standard deviation).",
         *(f"{name}: {i.value:.5g}, 95 % between {i.low:.5g} and {i.high:.5g}" for name, i in found.parameters.items()),
     ]
-    step = _largest_step(records)
-    smallest = step * SMALLEST_STEP
+    largest = _largest_step(records)
+    step = largest
     while True:
-        try:
-            return Draft(
-                process, plant, step, at, effort, (low, high), sample_period=period, title=title, notes=tuple(notes)
-            )
-        except PlantError:
-            step = significant(0.5 * step, 3)
-            if abs(step) < abs(smallest):
-                raise
+        for signed in (step, -step):  # where the actuator is one-sided, only one way may be open
+            try:
+                return Draft(
+                    process,
+                    plant,
+                    signed,
+                    at,
+                    effort,
+                    (low, high),
+                    sample_period=period,
+                    title=title,
+                    notes=tuple(notes),
+                )
+            except PlantError:
+                if abs(step) < SMALLEST_STEP * abs(largest):
+                    raise
+        step = significant(0.5 * step, 3)
 
 
 def _settled(value: float, found: Identified, effort: bool = False) -> float:
