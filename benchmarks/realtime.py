@@ -132,7 +132,7 @@ def idle_plant(period: float) -> Iterator[IdlePlant]:
         file = Path(folder) / "bench.yaml"
         file.write_text(
             f"/**: {{ros__parameters: {{sample_period: {period}, mode: realtime}}}}\n"
-            "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, setpoint: 1.0}}\n"
+            "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, sigma: 1.0, setpoint: 1.0}}\n"
         )
         with NodeProcesses(file, NAMESPACE) as nodes:
             conductor = Conductor(NAMESPACE, nodes.check)

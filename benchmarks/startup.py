@@ -37,6 +37,9 @@ except rclpy.executors.ExternalShutdownException:
 """
 
 
+CONTROLLER = [sys.executable, "-m", "tdof_npid_ros.graph", "controller"]
+
+
 def run(size: str) -> Result:
     """Each several times; what is compared, in turn."""
     repeats, firsts = (7, 3) if size == "full" else (1, 1)
@@ -53,7 +56,7 @@ def run(size: str) -> Result:
     bare, controller = [], []
     for _ in range(repeats):
         bare.append(_first_answer([sys.executable, "-c", BARE_NODE]))
-        controller.append(_first_answer([sys.executable, "-m", "tdof_npid_ros.graph", "controller"]))
+        controller.append(_first_answer([*CONTROLLER, "--ros-args", "-p", "sigma:=1.0"]))
     fresh = summary("first simulate, compilation included", "s", first, ours=True)
     bare_node = summary("a bare rclpy node until its first answer", "s", bare)
     node = summary("the controller node until its first answer", "s", controller, ours=True)
