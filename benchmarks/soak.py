@@ -59,7 +59,7 @@ def _watched(folder: Path, seconds: float) -> tuple[dict[str, list[float]], floa
     file = folder / "soak.yaml"
     file.write_text(
         f"/**: {{ros__parameters: {{sample_period: {PERIOD}, mode: realtime}}}}\n"
-        "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, setpoint: 1.0}}\n"
+        "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, sigma: 1.0, setpoint: 1.0}}\n"
         f"/**/recorder: {{ros__parameters: {{bag: {folder / 'bag'}}}}}\n"
     )
     memory: dict[str, list[float]] = {node: [] for node in NODES}
