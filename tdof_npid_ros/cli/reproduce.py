@@ -46,6 +46,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show(bar: tqdm[None], label: str) -> None:
-    if bar.desc:
+    if getattr(bar, "desc", ""):  # a bar that is not shown has none
         bar.update()
     bar.set_description(label)

@@ -25,6 +25,7 @@ from tdof_npid_ros.wire import EpisodeLabel
 
 PLANT = "plant."  # what begins the name of a plant's parameter in a plan
 PLANT_TIMEOUT_NS = 3_000_000_000  # an episode waits so long for a plant that tells of its episodes and can be reset
+SETPOINT_AHEAD_NS = 100_000_000  # by which a start's setpoint goes ahead of the plant's reset, on another way
 LOOK_PERIOD = 0.1  # s between two looks, in lockstep, whether the plant is there
 
 
@@ -108,6 +109,7 @@ class ScenarioNode(LoopNode):
         self.started_ns = 0
         self.told: Question[dict[str, Any]] | None = None  # what the plan will change of the plant
         self.placing: Question[dict[str, str]] | None = None  # where the plant begins
+        self.setpoint_told_ns = 0  # when the setpoint of a start at rest was told first
         self.resetting: Question[str] | None = None
         self.wait_until_ns = STEADY.now().nanoseconds + PLANT_TIMEOUT_NS
         if self.mode == "lockstep":
@@ -223,13 +225,15 @@ class ScenarioNode(LoopNode):
         start = math.inf if plan.start is None else plan.start
         if self.placing is None and start != self.placed_at:
             self.placing, self.placed_at = self.plant.ask_to_set_each({"start": start}), start
-        if self.placing is None or not self.placing.look():
-            return self.placing is None
-        if plan.start is not None and self.resetting is None:
-            if "start" in self.placing.answer:
-                self.refuse("rejected", "the plant cannot begin at rest", f": {self.placing.answer['start']}")
-            self._publish("setpoint", 0, plan.start)
-        return True
+        if self.placing is not None and not self.placing.look():
+            return False
+        if plan.start is None or self.resetting is not None:
+            return True
+        if self.placing is not None and "start" in self.placing.answer:
+            self.refuse("rejected", "the plant cannot begin at rest", f": {self.placing.answer['start']}")
+        self._publish("setpoint", 0, plan.start)
+        self.setpoint_told_ns = self.setpoint_told_ns or STEADY.now().nanoseconds
+        return bool(STEADY.now().nanoseconds - self.setpoint_told_ns > SETPOINT_AHEAD_NS)
 
     def _is_reset(self) -> bool:
         """Whether the plant has been asked to begin an episode, and tells or answers that it has."""

@@ -167,12 +167,11 @@ def test_the_convergence_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (tmp_path / "convergence").read_bytes().startswith(b"\x89PNG")
 
 
-def test_people_see_the_progress_and_the_optimum(capsys: pytest.CaptureFixture[str]) -> None:
+def test_people_see_the_optimum_and_a_log_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", *QUICK, "--controller", "pid"]) == 0
     captured = capsys.readouterr()
     assert "50 evaluations" in captured.out
-    for shown in ("generation", "best", "evaluations/s"):
-        assert shown in captured.err
+    assert "evaluations/s" not in captured.err  # that is for a terminal
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,9 @@ def test_an_episode_in_realtime_begins_at_rest_where_its_plan_says(graph: Any) -
     quick = {"sample_period": 0.05}
     outputs = graph.collect("output", JointState)
     efforts = graph.collect("control_effort", JointState)
-    graph.start("plant", **quick, gain=0.8, time_constant=2.0, dead_time=0.1, output_offset=20.0)
-    graph.start("controller", **quick, kp=1.0, ki=0.5, kd=0.1, alpha=0.3, sigma=40.0)
+    heater = {"gain": 0.8, "time_constant": 2.0, "dead_time": 0.1, "output_offset": 20.0}
+    graph.start("plant", **quick, **heater, effort_timeout=0.0)  # a busy machine is no silence here
+    graph.start("controller", **quick, kp=1.0, ki=0.5, kd=0.1, alpha=0.3, sigma=40.0, output_timeout=0.0)
     graph.wait_until(lambda: len(efforts) > 10, what="a loop that runs")
     graph.start("scenario", **quick, episodes=["held"], plan__held=["0 start 60", "6 disturbance 20", "16 end"])
     graph.wait_until(lambda: outputs[-1].position[0] > 61.0, what="the disturbance")
