@@ -12,7 +12,7 @@ from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.qos import signal_qos
 from tdof_npid_ros.graph.runtime.realtime import LatestTimes
 from tdof_npid_ros.plants.failsafe import FailSafe
-from tdof_npid_ros.wire import Sample
+from tdof_npid_ros.wire import AnswerLabel, Sample
 
 
 class RealtimePlant:
@@ -83,6 +83,10 @@ class RealtimePlant:
             self.missed_ticks = missed
 
     def _on_effort(self, sample: Sample) -> None:
+        episode = AnswerLabel.parse(sample.frame_id).episode
+        if episode is not None and episode != self._port.label:  # still on its way when the plant was reset
+            self._node.counts["late"] += 1
+            return
         effort = self._port.effort_of(sample)
         if effort is None:
             return
