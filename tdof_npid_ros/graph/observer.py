@@ -8,9 +8,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import rclpy
@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.graph.runtime.messages import node_of, signal_message
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
-from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
+from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
 from tdof_npid_ros.wire import JOINT_STATE, SECOND, Sample, SignalReader
 
@@ -198,10 +198,6 @@ class LoopObserver:
             self._remotes[node] = RemoteNode(self.node, self.node.resolve_topic_name(node), timeout=5.0)
         return self._remotes[node]
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Question[None]:
-        """Ask for parameters to be set together, without waiting."""
-        return self.remote(node).ask_to_set(values)
-
     def publish(self, topic: str, values: Sequence[float]) -> None:
         """Give a setpoint, disturbance or manual effort on its topic: one value, or one per lane."""
         message = signal_message("")
@@ -216,7 +212,3 @@ class LoopObserver:
     def flush(self, topic: str) -> None:
         """Wait until what was published has been received."""
         self._publishers[topic].wait_for_all_acked(Duration(seconds=2.0))
-
-    def reset(self) -> Question[str]:
-        """Ask the plant to begin once more, without waiting."""
-        return self.remote("plant").ask_trigger("reset")
