@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import Gains
@@ -138,6 +137,8 @@ def _offset_output(case: Case, plant: Ode | Sprott, gains: Gains, r: float, d: f
 
     def unbalanced(y: float) -> float:
         return _at_rest(case, plant, y, d).initial_effort - float(c[KP] * ((1.0 - c[ALPHA]) * r - y))
+
+    from scipy.optimize import brentq  # takes as long to import as NumPy and Numba together
 
     size = max(abs(r), 1e-3)
     low = high = r
