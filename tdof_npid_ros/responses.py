@@ -213,7 +213,9 @@ def _measured(lane: Lane, change: _Change, last: int) -> Response:
     start_s, end_s = float(lane.time[change.at]), float(lane.time[last])
     missing = int(np.isnan(y).sum())
     if missing:
-        return Response(change.kind, start_s, end_s, None, None, f"{missing} outputs are missing from the bag")
+        return Response(
+            change.kind, start_s, end_s, None, None, f"{missing} outputs are missing from the bag, or are no numbers"
+        )
     if np.isnan(r).any():
         return Response(change.kind, start_s, end_s, None, None, NO_SETPOINT)
     period, turn = lane.sample_period, lane.turn

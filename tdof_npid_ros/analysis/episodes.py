@@ -15,18 +15,21 @@ from tdof_npid_ros.analysis.loops import ObservedLoop, observed_loops
 from tdof_npid_ros.analysis.parameters import Configuration, ParameterHistory, configurations, scenario_plans
 from tdof_npid_ros.analysis.recording import PLAN_AFTER_RESET_NS
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
-from tdof_npid_ros.analysis.tracks import Key, Track, held, matched
+from tdof_npid_ros.analysis.tracks import Key, Track, held, latest_told, matched
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.noise import largest_noise
-from tdof_npid_ros.responses import Lane, largest_move
+from tdof_npid_ros.responses import ROUNDING, Lane, largest_move
 from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
 LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
+LONGEST_HELD = 10  # periods that an output stands in for those that are not in the bag
+TURN = 2 * np.pi
+TURNED = 0.9  # of a turn, between two outputs: not the way that a joint has gone
 UNPLANNED = "recording"  # the name of an episode without a plan
 ANSWERS_BY_STAMP = 0.5  # of the efforts bear an output's stamp: then they are answers to outputs
 
@@ -55,7 +58,7 @@ class Episode:
         begins: by lane, whether the first setpoint came with the first output, rather than stood before.
         from_rest: whether the loop starts with the first output.
         largest_step: of the setpoint in the scenario; None where the bag does not tell.
-        turn: of angles, else 0.
+        turn: by lane, of angles, else 0.
         notes: what was guessed or mended.
         hint: where a setpoint might be, if none was found.
     """
@@ -82,7 +85,7 @@ class Episode:
     begins: np.ndarray
     from_rest: bool
     largest_step: float | None
-    turn: float
+    turn: tuple[float, ...]
     notes: tuple[str, ...]
     hint: str
 
@@ -110,7 +113,7 @@ class Episode:
             disturbance_is_new=self.from_rest,
             seen_late=self.plan is None,
             largest_step=self.largest_step,
-            turn=self.turn,
+            turn=self.turn[lane],
         )
 
 
@@ -262,14 +265,17 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
     grid = _grid(stamps, period_ns, plan, loop.bag)
     hold = not digest
     sampling = _Sampling(grid, period_ns, output, stamps, first, hold)
-    rows = output.table(keys)
-    y = sampling.by_stamp(stamps, (held(rows) if hold else rows)[first])
+    y = sampling.outputs(output.table(keys))
     effort = sampling.of_answers(loop.effort, view.answers, keys)
     start_ns = int(output.receive_ns[0])
     used = _used(loop, view.answers, known)
     plant = loop.plant.at(start_ns) if loop.plant is not None else {}
     from_rest = _is_start(view, int(grid[0]), plant, y)
     begins = np.full(len(keys), from_rest)
+    turn = _turn(loop, used, start_ns)
+    angles = (
+        [] if used or loop.controller is not None else [lane for lane in range(len(keys)) if turns_over(y[:, lane])]
+    )
     if plan is not None:
         signals = plan.sampled(period_ns)
         setpoint, disturbance = (
@@ -307,9 +313,9 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
         missing=int(np.isnan(y).any(axis=1).sum()),
         begins=begins,
         from_rest=from_rest,
-        largest_step=_largest_step(loop, period_ns, plant, y, _turn(loop, used, start_ns), start_ns),
-        turn=_turn(loop, used, start_ns),
-        notes=loop.notes,
+        largest_step=_largest_step(loop, period_ns, plant, y, turn, start_ns),
+        turn=tuple(TURN if lane in angles else turn for lane in range(len(keys))),
+        notes=(*loop.notes, *(f"{_called(keys[lane])} turns over at its end: measured as an angle" for lane in angles)),
         hint=loop.hint,
     )
 
@@ -349,6 +355,19 @@ class _Sampling(NamedTuple):
     stamps: np.ndarray
     first: np.ndarray
     hold: bool
+
+    def outputs(self, rows: np.ndarray) -> np.ndarray:
+        """The outputs, a row for each message, on the grid; NaN where the bag has none.
+
+        Where all outputs do not come on the grid (`hold`), the value before stands in for a while.
+        """
+        if not self.hold:
+            return self.by_stamp(self.stamps, rows[self.first])
+        latest = latest_told(rows)
+        values = self.by_stamp(self.stamps, np.take_along_axis(rows, latest, axis=0)[self.first])
+        told_at = self.by_stamp(self.stamps, (self.output.stamp_ns - self.grid[0])[latest][self.first])
+        values[(self.grid - self.grid[0])[:, None] - told_at > LONGEST_HELD * self.period_ns] = np.nan
+        return values
 
     def by_stamp(self, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Rows (stamps, lanes) on the grid: those of its stamps, or the nearest and then held; NaN before the first."""
@@ -399,8 +418,26 @@ def _used(loop: ObservedLoop, answers: np.ndarray, known: Mapping[str, Configura
 def _turn(loop: ObservedLoop, used: Sequence[Configuration], start_ns: int) -> float:
     """Of angles, if the controller takes setpoint and output for such."""
     if not used and loop.controller is not None and loop.controller.at(start_ns).get("angle") is True:
-        return 2 * np.pi
+        return TURN
     return max((configuration.options.turn for configuration in used), default=0.0)
+
+
+def turns_over(output: np.ndarray) -> bool:
+    """Whether an output (samples,) is an angle that jumps at the end of its turn, from -π to π or from 0 to 2π.
+
+    >>> turns_over(np.array([3.0, 3.1, -3.1, -3.0])), turns_over(np.array([3.0, 3.1, 3.2, 3.3]))
+    (True, False)
+    """
+    known = output[~np.isnan(output)]
+    if not known.size or np.abs(np.diff(known)).max(initial=0.0) < TURNED * TURN:
+        return False
+    margin = TURN * ROUNDING
+    begin = -TURN / 2 if known.min() < 0 else 0.0
+    return bool(begin - margin <= known.min() and known.max() <= begin + TURN + margin)
+
+
+def _called(key: Key) -> str:
+    return key if isinstance(key, str) else f"lane {key}"
 
 
 def _largest_step(

@@ -15,6 +15,7 @@ Key = str | int  # of a value: the name that it bears, or its place in a message
 JUDGED = 5  # messages from which on a publisher's clock is judged
 CLOCK_NOISE_NS = 1_000_000  # a message is not published later than this after it was logged
 CLOCK_SKEW_NS = 50_000_000  # between the least delays of two topics: their publishers' clocks differ
+LATE_PERIODS = 3  # sample periods by which an output may be late; later ones come in bursts
 NAMED_LANE = "lane"  # our own signals call their lanes lane0, lane1, …: that is a place, no joint
 
 
@@ -142,7 +143,10 @@ def on_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str | None]:
     """The tracks with receive times that can be compared, and a note where these are not the publish times.
 
     Publish times are finer, but may be of hosts whose clocks differ; then it is the log times. Where all is logged at
-    one time, the stamps must do.
+    one time, or outputs come late, in bursts, the stamps must do, if all have them.
+
+    Args:
+        tracks: the output's first.
     """
     offsets = [track.log_ns - track.receive_ns for track in tracks if len(track)]
     least = [int(offset.min()) for offset in offsets if offset.size >= JUDGED]
@@ -158,7 +162,30 @@ def on_one_clock(tracks: Sequence[Track]) -> tuple[list[Track], str | None]:
     if len(output) > 1 and (output.receive_ns == output.receive_ns[0]).all() and output.stamp_ns.any():
         found = [replace(track, receive_ns=track.stamp_ns) if track.stamp_ns.any() else track for track in found]
         note = "all messages bear one receive time: they are put in order by their stamps"
+    elif (late_ns := _lateness(output)) > 0:
+        if all(_is_stamped_like(track, late_ns) for track in found):
+            found = [replace(track, receive_ns=track.stamp_ns) for track in found]
+            note = "outputs were received late: messages are put in order by their stamps"
+        else:
+            note = f"outputs were received up to {late_ns / 1e9:.2g} s late: when a setpoint came is known no better"
     return found, note
+
+
+def _lateness(output: Track) -> int:
+    """How many ns outputs of a clock that agrees are received late, if many come later than some sample periods."""
+    steps = np.diff(output.stamp_ns)
+    if len(output) < JUDGED or not (output.stamp_ns > 0).all() or (steps < 0).any() or not (steps > 0).any():
+        return 0
+    delays = output.receive_ns - output.stamp_ns
+    period = np.median(steps[steps > 0])
+    agrees = abs(int(delays.min())) <= CLOCK_SKEW_NS
+    return int(np.ptp(delays)) if agrees and np.quantile(delays, 0.9) > LATE_PERIODS * period else 0
+
+
+def _is_stamped_like(track: Track, late_ns: int) -> bool:
+    """Whether all messages of a track bear stamps of the clock by which they were received, up to so much earlier."""
+    delays = track.receive_ns - track.stamp_ns
+    return bool((np.abs(delays - late_ns // 2) <= late_ns // 2 + CLOCK_SKEW_NS).all())
 
 
 def by_place(track: Track) -> Track:
@@ -169,26 +196,28 @@ def by_place(track: Track) -> Track:
 
 def held(table: np.ndarray) -> np.ndarray:
     """The table with each NaN replaced by the value before it in its column; NaN before the first."""
-    missing = np.isnan(table)
-    if not missing.any():
-        return table
-    at = np.where(missing, 0, np.arange(len(table))[:, None])
-    np.maximum.accumulate(at, axis=0, out=at)
-    filled: np.ndarray = np.take_along_axis(table, at, axis=0)
+    filled: np.ndarray = np.take_along_axis(table, latest_told(table), axis=0)
     return filled
+
+
+def latest_told(table: np.ndarray) -> np.ndarray:
+    """For each place of a table the row, at or above it, that is the last one with a value; 0 where there is none."""
+    latest = np.where(np.isnan(table), 0, np.arange(len(table))[:, None])
+    return np.maximum.accumulate(latest, axis=0, out=latest)
 
 
 def layouts_of(names: np.ndarray, values: np.ndarray) -> tuple[Layout, ...]:
     """Layouts from columns: names and values of each message, (messages, n) or (messages,) of arrays.
 
-    A message without values tells nothing; one with other than one name per value goes by place.
+    A message without values tells nothing; one with other than one name per value goes by place. What is infinite is
+    NaN, no value.
     """
-    groups = _alike(names, values)
-    return tuple(
-        Layout(keys, rows, np.stack([values[row] for row in rows]) if values.dtype == object else values[rows])
-        for keys, rows in groups
-        if keys
-    )
+    found = []
+    for keys, rows in _alike(names, values):
+        mine = np.stack([values[row] for row in rows]) if values.dtype == object else values[rows]
+        if keys:
+            found.append(Layout(keys, rows, np.where(np.isinf(mine), np.nan, mine)))
+    return tuple(found)
 
 
 def _alike(names: np.ndarray, values: np.ndarray) -> list[tuple[tuple[Key, ...], np.ndarray]]:

@@ -434,3 +434,55 @@ def test_parameter_events_of_another_type_spoil_nothing(tmp_path) -> None:
     odd = [(0, "/parameter_events", FLOAT64, float64(1.0)), (0, "/scenario_plan", FLOAT64, float64(1.0))]
     told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
     assert is_the_step(by_joint(analyze([write(tmp_path / "bag", odd + told)]))["a"][0])
+
+
+# What is missing, and what comes late
+
+
+def test_a_gap_in_the_outputs_is_not_filled(tmp_path) -> None:
+    """A few lost messages are no matter; of a second without outputs nobody knows the error."""
+    slow = follows(0.0, [(1.0, 1.0)], tau=1.0)
+    lost = np.random.default_rng(0).random(800) < 0.1
+    told = setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    few = [m for m in measured({"a": slow}, 8.0) if not lost[m[0] // H_NS]]
+    (response,) = by_joint(analyze([write(tmp_path / "few", few + told)]))["a"]
+    assert response.iae == pytest.approx(1.0, rel=0.01)
+    many = [m for m in measured({"a": slow}, 8.0) if not 1.2e9 < m[0] < 2.2e9]
+    report = analyze([write(tmp_path / "many", many + told)])
+    (response,) = by_joint(report)["a"]
+    assert (response.metrics, response.iae) == (None, None)
+    assert "outputs are missing" in report.table() and report.as_json()["episodes"][0]["missing"] > 80
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_output_that_is_no_number_is_missing(tmp_path, value) -> None:
+    told = setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    for count, is_known in ((3, True), (30, False)):
+        broken = lambda t: value if 2 <= t < 2 + count / 100 else STEP(t)  # noqa: B023, E731
+        bag = write(tmp_path / f"{count}", measured({"a": broken, "b": STANDS}) + told)
+        (response,) = by_joint(analyze([bag]))["a"]
+        assert is_the_step(response) if is_known else response.iae is None and "no numbers" in str(response.reason)
+
+
+@pytest.mark.parametrize("begin", [-np.pi, 0.0])
+def test_an_angle_that_turns_over_is_measured_as_one(tmp_path, begin) -> None:
+    """Nothing else tells in a robot's bag: the joint jumps by a turn."""
+    inside = lambda angle: (angle - begin) % (2 * np.pi) + begin  # noqa: E731
+    start, end = begin - 0.1, begin + 0.2
+    way = follows(start, [(1.0, end)])
+    bag = measured({"a": lambda t: inside(way(t)), "b": STANDS})
+    told = setpoints([(0, {"a": inside(start), "b": 5}), (1, {"a": inside(end)})])
+    report = analyze([write(tmp_path / "bag", bag + told)])
+    (response,) = by_joint(report)["a"]
+    assert is_the_step(response, 0.3) and by_joint(report)["b"][0].iae == 0.0
+    assert "a turns over at its end: measured as an angle" in report.table()
+
+
+def test_outputs_that_are_received_in_bursts_are_put_in_order_by_stamps_that_all_have(tmp_path) -> None:
+    bursts = [((m[0] // 10**8 + 1) * 10**8 + m[0] // H_NS % 10, *m[1:]) for m in measured({"a": STEP})]
+    stamped = [(t, "/setpoint", JOINT_STATE, joints({"a": r}, START_NS + t)) for t, r in ((0, 0.0), (10**9 - 1000, 1))]
+    report = analyze([write(tmp_path / "stamped", bursts + stamped)])
+    (response,) = by_joint(report)["a"]
+    assert is_the_step(response) and "put in order by their stamps" in report.table()
+    report = analyze([write(tmp_path / "not", bursts + setpoints([(0, {"a": 0}), (1, {"a": 1})]))])
+    assert "outputs were received up to 0.09 s late: when a setpoint came is known no better" in report.table()
