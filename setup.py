@@ -15,6 +15,7 @@ by_colcon = "install" in sys.argv or "develop" in sys.argv
 node_scripts = [f"{node} = {NAME}.graph.__main__:{node}" for node in NODES] if by_colcon else []
 
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+CLUSTER = ["dask>=2025.1", "distributed>=2025.1"]
 PAPER = ["pymoo>=0.6,<0.7", "cma>=4,<5"]
 BENCH = [
     "control==0.10.2",
@@ -82,7 +83,13 @@ setup(
         "bokeh>=3.4",
         "tqdm>=4.60",
     ],
-    extras_require={"ros": ROS, "paper": PAPER, "test": [*TEST, *PAPER], "bench": BENCH},
+    extras_require={
+        "ros": ROS,
+        "paper": PAPER,
+        "cluster": CLUSTER,
+        "test": [*TEST, *PAPER, *CLUSTER],
+        "bench": [*BENCH, *CLUSTER],
+    },
     entry_points={"console_scripts": [f"tdof-npid = {NAME}.cli:entry", *node_scripts]},
     zip_safe=False,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file
 from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
 from tdof_npid_ros.plants.noise import largest_noise, noiseless
+from tdof_npid_ros.plants.ode import class_by_value, take_class
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
@@ -55,6 +56,17 @@ class Case:
     weight: float = WEIGHT.default
     options: ControllerOptions = PLAIN
     search: Mapping[str, Any] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a worker is sent: the fields, and a user's plant class by value."""
+        state = {one.name: getattr(self, one.name) for one in fields(self)}
+        return state | {"class": class_by_value(self.model)} if ":" in self.model else state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        by_value = state.pop("class", None)
+        self.__dict__.update(state)
+        if by_value is not None:
+            self.__dict__["model"] = take_class(self.model, by_value)
 
     @property
     def sample_period(self) -> float:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import importlib
 import importlib.machinery
 import inspect
 import math
+import pickle
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -219,6 +221,32 @@ def loaded_class(path: str) -> Any:
             "give the parameter file that does (--case FILE)"
         )
     return _loaded[path]
+
+
+def class_by_value(path: str) -> bytes:
+    """A class that the user has named, with all of its module that it uses, for a process that has not its file.
+
+    It runs there under the same Python, and imports there what its module imports.
+    """
+    import cloudpickle
+
+    module = sys.modules[path.partition(":")[0].partition(".")[0]]
+    cloudpickle.register_pickle_by_value(module)
+    try:
+        return bytes(cloudpickle.dumps(loaded_class(path)))
+    finally:
+        cloudpickle.unregister_pickle_by_value(module)
+
+
+def take_class(path: str, by_value: bytes) -> str:
+    """Load a class that came from another process; returns what its `model` is called here.
+
+    The name tells its content: another version of it, or another class of that name, may be loaded too.
+    """
+    name = f"{path}@{hashlib.sha256(by_value).hexdigest()[:8]}"
+    if name not in _loaded:
+        _loaded[name] = pickle.loads(by_value)
+    return name
 
 
 @contextmanager

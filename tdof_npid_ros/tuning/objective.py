@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,6 +14,7 @@ from tdof_npid_ros.control.gains import gains_from_candidates
 from tdof_npid_ros.loop import VECTOR, Integrals, joined
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
+from tdof_npid_ros.workers import available_cores
 
 LARGEST_IAE = 1e30
 """unit·s: an IAE above it is compressed; such a loop is useless, and only its place in the order matters."""
@@ -88,11 +88,6 @@ class Objective:
         running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
         setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance
-
-
-def available_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0))
 
 
 def _blocks(lanes: int, threads: int) -> list[slice]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -97,6 +97,10 @@ class TuningProblem:
         if self.constraints.given and self.screen is None:
             asked = ", ".join(self.constraints.given)
             raise TuningError(f"{self.without_margins}: no margins are known here, tune without {asked}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: the rest follows from them where it is needed."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def _check_bounds(self) -> None:
         bounds = dict(zip(self.names, self.bounds, strict=True))

@@ -12,15 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tdof_npid_ros.case import Case
+from tdof_npid_ros.checkpoint import CheckpointError, first_difference, read_checkpoint, write_checkpoint
 from tdof_npid_ros.control.gains import ControllerType, Gains
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.output_file import hold
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores
-from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import make_optimizer, restore_optimizer
@@ -68,8 +68,9 @@ class Study:
             resume: go on from the checkpoint if there is one.
 
         Raises:
-            TuningError: the problem cannot be searched; the checkpoint is of another problem, damaged or of a newer
-                version; or it is there but not to be resumed. Nothing is overwritten.
+            TuningError: the problem cannot be searched.
+            CheckpointError: the checkpoint is of another problem, damaged or of a newer version; or it is there but
+                not to be resumed. Nothing is overwritten.
             OutputError: another run writes the checkpoint.
         """
         self.problem = problem
@@ -84,7 +85,7 @@ class Study:
         elif resume:
             self._restore(checkpoint)
         else:
-            raise TuningError(f"checkpoint {checkpoint} exists: resume it, or give another file")
+            raise CheckpointError(f"checkpoint {checkpoint} exists: resume it, or give another file")
 
     @property
     def done(self) -> bool:
@@ -148,7 +149,8 @@ class Study:
         """Take the scores of the candidates asked, and save the checkpoint.
 
         Raises:
-            TuningError: not one finite score per candidate, or the checkpoint cannot be written.
+            TuningError: not one finite score per candidate.
+            CheckpointError: the checkpoint cannot be written.
         """
         optimizer = self._optimizer
         before = optimizer.best_violation, optimizer.best_value
@@ -192,29 +194,20 @@ class Study:
                 "improvements": self._improvements,
                 "optimizer": self._optimizer.state(),
             }
-            write_checkpoint(self._checkpoint, content)
+            write_checkpoint(self._checkpoint, "tuning", content)
 
     def _restore(self, path: Path) -> None:
-        content = read_checkpoint(path)
-        here = self.problem.description()
-        there = content.get("problem")
-        if there != here:
-            raise TuningError(f"checkpoint {path} is of another problem: {_difference(there, here)}")
+        content = read_checkpoint(path, "tuning")
+        difference = first_difference(content.get("problem"), self.problem.description())
+        if difference:
+            raise CheckpointError(f"checkpoint {path} is of another problem: {difference}")
         try:
             self._improvements = [Improvement(*one) for one in content["improvements"]]
             self._optimizer = restore_optimizer(content["optimizer"])
         except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, TuningError) as error:
-            raise TuningError(
+            raise CheckpointError(
                 f"checkpoint {path} is damaged, start anew with another file: {one_line(error)}"
             ) from None
-
-
-def _difference(there: Any, here: dict[str, Any]) -> str:
-    """What differs between two problems' descriptions, the first such thing."""
-    if not isinstance(there, dict):
-        return "it describes none"
-    key = next(key for key in (*here, *there) if there.get(key) != here.get(key))
-    return f"{key} is {there.get(key)} there and {here.get(key)} here"
 
 
 def tune_case(

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.checkpoint import VERSION, read_checkpoint, write_checkpoint
+from tdof_npid_ros.checkpoint import VERSIONS, CheckpointError, read_checkpoint, write_checkpoint
 
 PROGRAM = [sys.executable, "-m", "tdof_npid_ros"]
 TUNE = [*PROGRAM, "tune", "p3-c1", "--controller", "pid", "--population", "10", "--generations", "3"]
@@ -31,7 +30,7 @@ def test_a_result_is_written_whatever_becomes_of_the_streams(tmp_path: Path, str
     done = shell(f'"$@" {streams}', *TUNE, "--out", str(out), "--checkpoint", str(tmp_path / "c"))
     assert done.returncode == 0, done.stderr
     assert "kp:" in out.read_text()
-    assert read_checkpoint(tmp_path / "c")["optimizer"]
+    assert read_checkpoint(tmp_path / "c", "tuning")["optimizer"]
     assert b"Traceback" not in done.stderr
 
 
@@ -86,9 +85,9 @@ def test_two_runs_do_not_share_a_checkpoint(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", ["true", "null", '"1"', "1.5", "[1]", "0", "-1", "{}"])
 def test_a_version_that_is_none_is_refused(tmp_path: Path, version: str) -> None:
-    path = tmp_path / "c"
-    write_checkpoint(path, {})
-    assert read_checkpoint(path) == {}
-    path.write_text(path.read_text().replace(f'"version": {VERSION}', f'"version": {version}'))
-    with pytest.raises(TuningError, match="its version is"):
-        read_checkpoint(path)
+    path, known = tmp_path / "c", VERSIONS["tuning"]
+    write_checkpoint(path, "tuning", {})
+    assert read_checkpoint(path, "tuning") == {}
+    path.write_text(path.read_text().replace(f'"version": {known}', f'"version": {version}'))
+    with pytest.raises(CheckpointError, match="its version is"):
+        read_checkpoint(path, "tuning")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.case import load_case
-from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -84,7 +84,7 @@ def test_a_finished_checkpoint_resumes_to_its_result(tmp_path: Path) -> None:
 def test_an_existing_checkpoint_is_not_overwritten(tmp_path: Path) -> None:
     after(2, Study(PROBLEM, tmp_path / "c"))
     before = (tmp_path / "c").read_bytes()
-    with pytest.raises(TuningError, match="exists: resume it"):
+    with pytest.raises(CheckpointError, match="exists: resume it"):
         Study(PROBLEM, tmp_path / "c")
     assert (tmp_path / "c").read_bytes() == before
 
@@ -109,7 +109,7 @@ def test_an_existing_checkpoint_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_checkpoint_of_another_problem_is_refused(change: dict[str, Any], told: str, tmp_path: Path) -> None:
     after(2, Study(PROBLEM, tmp_path / "c"))
     before = (tmp_path / "c").read_bytes()
-    with pytest.raises(TuningError, match="of another problem") as error:
+    with pytest.raises(CheckpointError, match="of another problem") as error:
         Study(replace(PROBLEM, **change), tmp_path / "c", resume=True)
     assert told in str(error.value)
     assert (tmp_path / "c").read_bytes() == before
@@ -137,21 +137,19 @@ def test_a_damaged_or_newer_checkpoint_is_refused_and_kept(how: str, tmp_path: P
     after(4, Study(PROBLEM, path))
     path.write_text(damaged(path.read_text())[how], encoding="utf-8", errors="surrogateescape")
     before = path.read_bytes()
-    with pytest.raises(TuningError, match="update the program" if how == "newer" else "checkpoint") as error:
+    with pytest.raises(CheckpointError, match="update the program" if how == "newer" else "checkpoint") as error:
         Study(PROBLEM, path, resume=True)
     assert "\n" not in str(error.value)
     assert path.read_bytes() == before
 
 
 def test_a_state_of_the_optimiser_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    from tdof_npid_ros.tuning.checkpoint import read_checkpoint, write_checkpoint
-
     path = tmp_path / "c"
     after(4, Study(PROBLEM, path))
-    content = read_checkpoint(path)
+    content = read_checkpoint(path, "tuning")
     content["optimizer"]["candidates"] = "none"
-    write_checkpoint(path, content)
-    with pytest.raises(TuningError, match="is damaged"):
+    write_checkpoint(path, "tuning", content)
+    with pytest.raises(CheckpointError, match="is damaged"):
         Study(PROBLEM, path, resume=True)
 
 
@@ -163,7 +161,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(tmp_path: Path, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(TuningError, match="cannot be written: No space left on device"):
+    with pytest.raises(CheckpointError, match="cannot be written: No space left on device"):
         after(3, study)
     assert (tmp_path / "c").read_bytes() == before
     assert list(tmp_path.iterdir()) == [tmp_path / "c"]
