@@ -27,7 +27,12 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...] | None, str], ...] = (
     ("type", "", ("", "pid", "npid", "tdof_npid1", "tdof_npid2"), f"of the controller; empty: {FILES}"),
     ("bag", "", None, f"folder that the recorder writes; empty: {FILES}"),
     ("lossless", "", ("", *SWITCH), f"lockstep: wait for the recorder; empty: {FILES}"),
-    ("publish_clock", "", ("", *SWITCH), f"lockstep: the plant publishes /clock; empty: {FILES}"),
+    (
+        "publish_clock",
+        "",
+        ("", *SWITCH),
+        f"whether the plant publishes /clock; empty: {FILES}",
+    ),
     ("log_level", "info", ("debug", "info", "warn", "error", "fatal"), "of all nodes"),
     ("stay", "false", SWITCH, "stay when all episodes have been played"),
     *((node, "true", SWITCH, f"start the {node}") for node in NODES),

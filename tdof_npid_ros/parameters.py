@@ -339,7 +339,12 @@ PLANT: Final = table(
     Parameter(
         "retries", 20, "lockstep: how often an output is repeated before the plant stops", within=Range(0, 10**9)
     ),
-    Parameter("publish_clock", True, "lockstep: publish the loop's time on /clock", fixed=True),
+    Parameter(
+        "publish_clock",
+        True,
+        "publish the loop's time on /clock: in lockstep, and in realtime at a speed other than 1",
+        fixed=True,
+    ),
     SPEED,
     Parameter(
         "effort_timeout",

@@ -32,9 +32,8 @@ class Difference:
 
     def lines(self) -> list[str]:
         """The difference for people, numbers in full."""
-        place = (
-            f"{self.topic}, message {self.step}, at {self.stamp_ns / 1e9:.9g} s of {self.episode or 'the recording'}"
-        )
+        stamp = "{}.{:09}".format(*divmod(self.stamp_ns, 10**9)).rstrip("0").rstrip(".")  # as exact as in ROS time
+        place = f"{self.topic}, message {self.step}, at {stamp} s of {self.episode or 'the recording'}"
         return [
             f"first difference: {self.what} in {place}",
             *(f"  {name:22} {value}" for name, value in self.inputs.items()),

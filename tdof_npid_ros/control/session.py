@@ -6,6 +6,7 @@ through the same decisions about where a loop begins, so what the one computed t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -68,10 +69,10 @@ SAME, LATE = Judgement("same"), Judgement("late")
 
 
 def is_at_beginning(place: Place) -> bool:
-    """Whether a controller that comes upon this output comes at the beginning of the episode.
+    """Whether the stamp alone says that a controller which comes upon this output comes at the beginning.
 
-    In lockstep it does with the stamp 0, which only the first output of an episode has. In realtime it may have missed
-    some outputs by then.
+    In lockstep the stamp 0 does, which only the first output of an episode has. In recordings of before 2027, realtime
+    began with 0, too, and a controller may have missed some outputs by then.
     """
     return place.stamp_ns == 0 or (not (place.label and place.label.plan) and place.stamp_ns < FAR_NS)
 
@@ -79,9 +80,10 @@ def is_at_beginning(place: Place) -> bool:
 class OutputSequence:
     """The outputs that one controller answers, in order: which of them begins, continues or disturbs the loop.
 
-    A loop of our plant begins with a label that is new. (A replay of it begins with the stamp 0 once more.) What the
-    controller comes upon in the middle it joins. An output that bears no label never begins anything, nor does it come
-    between the outputs of a plant that labels them.
+    A loop of our plant begins with a label that is new. (A replay of it begins with that output once more.) What the
+    controller comes upon in the middle it joins. Which of the two the first output of all is, nothing before it can
+    tell: in lockstep its stamp does; in realtime the loop begins here if nobody drives the plant yet. An output that
+    bears no label never begins anything, nor does it come between the outputs of a plant that labels them.
 
     Args:
         sample_period_ns: of the loop.
@@ -92,23 +94,28 @@ class OutputSequence:
 
     def __init__(self, sample_period_ns: int) -> None:
         self.latest: Place | None = None
+        self._began: Place | None = None  # the output with which the loop began, from rest
         self._far_ns = max(FAR_NS, IN_A_ROW * sample_period_ns)
         self._known: dict[str, EpisodeLabel] = {}  # the latest label of each activation
         self._astray: Place | None = None
         self._in_a_row = 0
 
-    def judge(self, place: Place, silent: bool = False, elapsed_ns: int = 0) -> Judgement:
+    def judge(
+        self, place: Place, silent: bool = False, elapsed_ns: int = 0, driven: Callable[[], bool] = lambda: True
+    ) -> Judgement:
         """Decide about an output.
 
         Args:
             place: the output's.
             silent: the loop has stood still: whoever comes now may go on with it.
             elapsed_ns: since the latest output that was answered came.
+            driven: whether there is an effort, or an integral action, to go on from.
         """
         latest = self.latest
         if place == latest:
             return SAME
-        if place.label is not None and self._is_start(place):
+        if place.label is not None and self._is_start(place, driven):
+            self._began = place
             return START
         if latest is None or (silent and self._may_take_over(latest, place)):
             return JOIN
@@ -148,15 +155,15 @@ class OutputSequence:
     def _goes_on(latest: Place, place: Place) -> bool:
         return place.label == latest.label and place.stamp_ns > latest.stamp_ns
 
-    def _is_start(self, place: Place) -> bool:
+    def _is_start(self, place: Place, driven: Callable[[], bool]) -> bool:
         label, latest = place.label, self.latest
         assert label is not None
-        if place.stamp_ns == 0:
+        if place.stamp_ns == 0 or place == self._began:
             return True
         if latest is not None and label == latest.label:
             return False
         if not self._known:
-            return is_at_beginning(place)
+            return is_at_beginning(place) or not (label.plan or driven())
         known = self._known.get(label.activation)
         return known is None or label.follows(known)
 
@@ -307,11 +314,11 @@ class Session:
 
     # In the loop
 
-    def take(self, output: Sample, now_ns: int) -> Outcome:
+    def take(self, output: Sample, now_ns: int | None) -> Outcome:
         """Decide about an output, and answer it.
 
         Args:
-            now_ns: when it came, on a clock that is never set.
+            now_ns: when it came, on a clock that is never set; or in simulated time, None before that has begun.
         """
         try:
             y = self.joints.selected(output.name, output.position)
@@ -328,9 +335,9 @@ class Session:
         if setpoint is None:
             self.waiting = output
             return Outcome("waiting", None)
-        elapsed_ns = 0 if self._arrival_ns is None else now_ns - self._arrival_ns
+        elapsed_ns = 0 if self._arrival_ns is None or now_ns is None else now_ns - self._arrival_ns
         silent = self.is_live and 0 < self.timeout_ns < elapsed_ns
-        decision, why, detail = self.sequence.judge(place, silent, elapsed_ns)
+        decision, why, detail = self.sequence.judge(place, silent, elapsed_ns, lambda: self._is_driven(output))
         if decision == "same":
             self._repeats += 1
             if place.label is None and y.tobytes() != self._answered.tobytes():
@@ -382,10 +389,16 @@ class Session:
             return _FINE
         return OFF_RATE, f": it is {mean_ns / 1e9:.4g} s, and sample_period is {period_ns / 1e9:g} s"
 
-    def look_for_silence(self, now_ns: int) -> bool:
-        """Whether the loop in realtime has just fallen silent."""
-        if self.silent or not self.is_live or not self.timeout_ns or self._arrival_ns is None:
+    def look_for_silence(self, now_ns: int | None) -> bool:
+        """Whether the loop in realtime has just fallen silent.
+
+        Args:
+            now_ns: as for `take`.
+        """
+        if self.silent or not self.is_live or not self.timeout_ns or now_ns is None:
             return False
+        if self._arrival_ns is None or self._arrival_ns > now_ns:  # simulated time that has begun, or begun again
+            self._arrival_ns = now_ns
         self.silent = now_ns - self._arrival_ns > self.timeout_ns
         return self.silent
 
@@ -414,6 +427,11 @@ class Session:
         except ValueError:
             return None
         return applied if len(applied) == self.controller.lanes and np.isfinite(applied).all() else None
+
+    def _is_driven(self, output: Sample) -> bool:
+        """Whether the plant has an effort, or this controller an integral action, to go on from."""
+        applied = self._applied(output)
+        return self.saved_integral is not None or applied is None or bool(applied.any())
 
     def _take_saved(self, decision: Decision) -> np.ndarray | None:
         if decision not in ("join", "start"):

@@ -33,7 +33,7 @@ class Conductor:
         check: called while waiting; raises if waiting is in vain.
 
     Attributes:
-        time_ns: the loop's time, in lockstep.
+        time_ns: of the present episode, as /clock tells.
         label, phase: what the plant says of its episode; None and empty before it has said anything.
     """
 
@@ -45,6 +45,7 @@ class Conductor:
         self._facts: dict[str, dict[str, str]] = {}
         self._remotes: dict[str, RemoteNode] = {}
         self.time_ns = 0
+        self._began_ns: int | None = None  # on /clock: the episode
         self.label: EpisodeLabel | None = None
         self.phase = ""
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -70,10 +71,15 @@ class Conductor:
             self._facts[node_of(status)] = {pair.key: pair.value for pair in status.values}
 
     def _on_clock(self, message: Clock) -> None:
-        self.time_ns = stamp_ns(message.clock)
+        now_ns = stamp_ns(message.clock)
+        if self._began_ns is None:  # in lockstep the loop's time is that of the episode
+            self._began_ns = 0 if self.label is None or self.label.plan else now_ns
+        self.time_ns = now_ns - self._began_ns
 
     def _on_episode(self, message: KeyValue) -> None:
-        self.label, self.phase = EpisodeLabel.parse(message.key), message.value
+        label, self.phase = EpisodeLabel.parse(message.key), message.value
+        if label != self.label:
+            self.label, self._began_ns = label, None
 
     @property
     def episodes_finished(self) -> int:

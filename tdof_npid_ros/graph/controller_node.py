@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -178,7 +177,7 @@ class ControllerNode(LoopEnd):
             self.counts["rejected"] += 1
 
     def _on_output(self, output: Sample) -> None:
-        outcome = self.session.take(output, time.monotonic_ns())
+        outcome = self.session.take(output, self.silence_ns)
         if outcome.answer is not None:
             self.effort_publisher.publish(self._message(outcome.answer))
             if self.effort_to is not None:
@@ -240,7 +239,7 @@ class ControllerNode(LoopEnd):
             self.effort_publisher.publish(self._message(session.answer))
 
     def _look_for_silence(self) -> None:
-        if self.session.look_for_silence(time.monotonic_ns()):
+        if self.session.look_for_silence(self.silence_ns):
             self.counts["silences"] += 1
             silence = f"no output for {self.session.timeout_ns / 1e9:g} s: the integral action waits. "
             self.get_logger().error(STUCK if self.session.is_stuck else f"{silence}Look after the plant")

@@ -89,7 +89,8 @@ class LoopObserver:
         self._outputs: dict[int, Sample] = {}
         self._labels: dict[str, int] = {}
         self._label = ""
-        self._base = self._last = 0.0
+        self._base = self._last = 0.0  # s: when the present label came, and the latest answer
+        self._began_ns = 0  # the label's first stamp
         self._latest_answer = 0.0
         self._remotes: dict[str, RemoteNode] = {}
         self._publishers = {
@@ -152,9 +153,10 @@ class LoopObserver:
         if output is None:
             return
         if output.frame_id != self._label:
-            self._label, self._base = output.frame_id, self._last - answer.stamp_ns / SECOND
+            self._label, self._began_ns = output.frame_id, answer.stamp_ns
+            self._base = self._last
             self._labels[self._label] = len(self._labels)
-        self._last = self._base + answer.stamp_ns / SECOND
+        self._last = self._time_of(answer)
         self._latest_answer = time.monotonic()
         self.rows.append(
             Row(
@@ -169,7 +171,7 @@ class LoopObserver:
         self.count += 1
 
     def _time_of(self, sample: Sample) -> float:
-        return self._base + sample.stamp_ns / SECOND
+        return self._base + (sample.stamp_ns - self._began_ns) / SECOND
 
     def rows_since(self, count: int) -> tuple[list[Row], int]:
         """The answers after the first `count` ones, as far as they are kept, and how many there have been in all."""

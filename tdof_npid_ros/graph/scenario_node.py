@@ -18,6 +18,7 @@ from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_s
 from tdof_npid_ros.graph.runtime.node import OK, STEADY, WARN, LoopNode
 from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS
+from tdof_npid_ros.graph.runtime.realtime import SteadyRosTime
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameters import PLAN, SCENARIO, sample_period_in_ns
 from tdof_npid_ros.scenario import Plan, parse_plan, read_episodes
@@ -66,8 +67,12 @@ class ScenarioNode(LoopNode):
         self.before: EpisodeLabel | None = None  # the plant's label before it was asked for an episode
         self.plant = RemoteNode(self, self.resolve_topic_name("plant"))
         self.subscribe(KeyValue, EPISODE, self._on_episode, LATCHED_QOS)
-        if self.mode == "lockstep":
+        self.zero_ns = 0  # the stamp of the plan's beginning
+        self.clock_ns = 0  # the latest on /clock
+        self.ros_time = SteadyRosTime(self.get_clock().now().nanoseconds, STEADY.now().nanoseconds)
+        if self.mode == "lockstep" or self.speed != 1.0:
             self.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
+        if self.mode == "lockstep":
             self.create_timer(LOOK_PERIOD, self._publish_plan_if_time, clock=STEADY)
         else:
             self.create_timer(self.period_ns / 1e9 / self.speed, self._on_tick, clock=STEADY)
@@ -148,7 +153,16 @@ class ScenarioNode(LoopNode):
             self._next()
 
     def _on_clock(self, message: ClockMessage) -> None:
-        self._advance_to(stamp_ns(message.clock))
+        self.clock_ns = stamp_ns(message.clock)
+        if self.mode == "lockstep":
+            self._advance_to(self.clock_ns)
+
+    @property
+    def ros_ns(self) -> int:
+        """ROS time now: the plant's where that goes at another speed."""
+        if self.in_simulated_time:
+            return int(self.get_clock().now().nanoseconds)
+        return self.clock_ns or self.ros_time.at(STEADY.now().nanoseconds)
 
     def _on_tick(self) -> None:
         if self.current is None:
@@ -159,13 +173,14 @@ class ScenarioNode(LoopNode):
         if not self.begun:
             self._begin_if_ready(self.current, now)
             return
-        now = int((now - self.started_ns) * self.speed)
-        self._advance_to(now)
-        if now >= self.current.end_ns:
+        passed = self.ros_ns - self.zero_ns if self.in_simulated_time else int((now - self.started_ns) * self.speed)
+        self._advance_to(passed)
+        if passed >= self.current.end_ns:
             self._next()
 
     def _advance_to(self, time_ns: int) -> None:
-        """Publish what the plan does up to `time_ns`, each point once, stamped with its own time."""
+        """Publish what the plan does up to `time_ns`, each point once, stamped with its own time: the loop's in
+        lockstep, ROS's in realtime."""
         plan = self.current
         if plan is None:
             return
@@ -186,7 +201,7 @@ class ScenarioNode(LoopNode):
     def _publish(self, name: str, time_ns: int, value: float) -> None:
         message = signal_message("")
         message.name = lane_names(1) if name == "disturbance" else []  # a setpoint's are names of joints
-        set_stamp(message.header.stamp, time_ns)
+        set_stamp(message.header.stamp, self.zero_ns + time_ns)
         setattr(message, "position" if name == "setpoint" else "effort", [value])
         self.publishers_of[name].publish(message)
 
@@ -203,7 +218,7 @@ class ScenarioNode(LoopNode):
             self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
         else:
             self.resetting.drop()
-        self.started_ns = now
+        self.started_ns, self.zero_ns = now, self.ros_ns
         self._publish_plan(plan)
 
     def _is_restored(self) -> bool:
@@ -231,6 +246,7 @@ class ScenarioNode(LoopNode):
             return True
         if self.placing is not None and "start" in self.placing.answer:
             self.refuse("rejected", "the plant cannot begin at rest", f": {self.placing.answer['start']}")
+        self.zero_ns = self.ros_ns
         self._publish("setpoint", 0, plan.start)
         self.setpoint_told_ns = self.setpoint_told_ns or STEADY.now().nanoseconds
         return bool(STEADY.now().nanoseconds - self.setpoint_told_ns > SETPOINT_AHEAD_NS)

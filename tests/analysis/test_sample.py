@@ -65,8 +65,9 @@ def test_foxglove_shows_values_that_are_there(reader) -> None:
     paths = [path for panel in layout["configById"].values() for path in panel.get("paths", [])]
     assert len(paths) == 8
     for path in paths:
-        topic, field, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d+)\]", path["value"]).groups()
-        assert len(values(reader, topic, field, int(index)))
+        topic, field, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d+|:)\]", path["value"]).groups()
+        assert path["timestampMethod"] == "headerStamp"
+        assert len(values(reader, topic, field, 0 if index == ":" else int(index)))
         if topic == "/controller_state":
             assert set(reader.columns(topic, ["name"])["name"][:, int(index)]) == {path["label"]}
 
@@ -76,7 +77,9 @@ def test_plotjuggler_shows_values_that_are_there(reader) -> None:
     layout = ElementTree.parse(ROOT / "config" / "plotjuggler.xml")
     series = [curve.attrib["name"] for curve in layout.iter("curve")]
     assert len(series) == 8
-    loaded = next(layout.iter("parameters")).attrib["selected_topics"].split(";")
+    loader = next(layout.iter("parameters")).attrib
+    assert (loader["use_timestamp"], loader["use_mcap_log_time"]) == ("1", "0")
+    loaded = loader["selected_topics"].split(";")
     for name in series:
         topic, element, field = re.fullmatch(r"(/\w+)/(\w+)/(\w+)", name).groups()
         assert topic in loaded

@@ -120,6 +120,37 @@ def test_the_decision_about_an_output(
     assert bool(outcome.why) == (decision == "refused")
 
 
+def test_who_comes_upon_a_plant_that_nobody_drives_begins_the_loop_whatever_its_stamps() -> None:
+    """ROS time tells no start; a plant in which no effort acts has nothing to go on from, unless we have."""
+    first = 1_800_000_000 * 10**9
+    for applied, decision in ((0.0, "start"), (0.25, "join"), (None, "join")):
+        assert session().take(output(LIVE, first, applied=applied), 0).decision == decision
+    paused = session()
+    paused.saved_integral = np.array([0.4])
+    outcome = paused.take(output(LIVE, first, applied=0.0), 0)
+    assert outcome.decision == "join" and outcome.answer is not None and outcome.answer.began_with == 0.4
+    lockstep = session()
+    lockstep.plan = load_case("p1-c0.5").plans["setpoint"]
+    assert lockstep.take(output(f"{lockstep.plan.digest}/a.1", PERIOD_NS, applied=0.0), 0).decision == "join"
+
+
+def test_a_replay_of_an_episode_in_ros_time_begins_with_its_first_output_again() -> None:
+    one, first = session(), 1_800_000_000 * 10**9
+    for begins in (first, first):
+        decisions = [one.take(output(LIVE, begins + k * PERIOD_NS, applied=0.0), 0).decision for k in range(30)]
+        assert decisions == ["start", *["new"] * 29]
+
+
+def test_silence_counts_in_simulated_time_which_may_not_have_begun_or_begin_again() -> None:
+    one, first = session(), 10**18
+    assert one.take(output(ROBOT, first), None).answer is not None
+    assert not one.look_for_silence(None) and not one.look_for_silence(10**18)  # the first /clock
+    assert not one.look_for_silence(10**18 + 400 * MS)
+    assert not one.look_for_silence(5 * MS)  # the simulation has been reset
+    assert one.take(output(ROBOT, first + PERIOD_NS), 10 * MS).decision == "new"
+    assert one.look_for_silence(520 * MS)
+
+
 def test_an_unstamped_message_at_a_steady_loop_changes_nothing_and_is_told() -> None:
     """What `ros2 topic pub --once /output sensor_msgs/msg/JointState "{position: [2.0]}"` sends."""
     for frame, first, why in ((LIVE, 0, UNLABELLED), (ROBOT, 10**18, UNSTAMPED)):

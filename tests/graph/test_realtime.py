@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from test_operation import Live
 
@@ -17,6 +18,9 @@ WARM_UP_SECONDS = min(60.0, SOAK_SECONDS / 2)
 
 def test_figures_and_speed(graph: Any) -> None:
     """At speed 5, 100 Hz of simulated time are 500 ticks a second; none is made up, none is lost."""
+    from rosgraph_msgs.msg import Clock
+
+    clock = graph.collect("/clock", Clock)
     live = Live(graph, "/fast", {"speed": 5.0}, {})
     live.settle()
 
@@ -36,8 +40,61 @@ def test_figures_and_speed(graph: Any) -> None:
     graph.wait_until(lambda: graph.fact("/fast/plant", "output_to_effort_p99_us"), what="the figures")
     for figure in ("period_error_p50_us", "period_error_p99_us", "output_to_effort_p50_us"):
         assert 0.0 <= float(graph.fact("/fast/plant", figure)) < 1e6
-    stamps = [m.header.stamp.sec * 1e9 + m.header.stamp.nanosec for m in live.outputs]
+    stamps = [ns(m.header.stamp) for m in live.outputs]
     assert set(b - a for a, b in zip(stamps, stamps[1:], strict=False)) == {10_000_000}
+    told = [ns(m.clock) for m in clock]
+    assert len(told) > 100 and set(told[10:-10]) <= set(stamps) and told == sorted(set(told))
+
+
+def test_stamps_are_ros_time_on_one_grid_and_go_on_over_a_reset(graph: Any) -> None:
+    """Also those of a scenario's signals; and the plant publishes no /clock, as time is the wall clock's."""
+    from sensor_msgs.msg import JointState
+    from std_srvs.srv import Trigger
+
+    live = Live(graph, "/ros", {}, {"setpoint": 0.0})
+    setpoints = graph.collect("/ros/setpoint", JointState)
+    graph.wait_until(lambda: len(live.efforts) > 50, what="a loop")
+    assert abs(ns(live.outputs[-1].header.stamp) - time.time_ns()) < 5e9
+    assert graph.call("/ros/plant/reset", Trigger, again=True).success
+    played = {"episodes": ["a"], "plan__a": ["0 setpoint 1", "0.5 setpoint 0.5", "1 end"]}
+    graph.start("scenario", namespace="/ros", mode="realtime", sample_period=0.01, **played)
+    graph.wait_until(lambda: any(m.position[0] == 0.5 for m in setpoints), what="the plan")
+    assert set(np.diff([ns(m.header.stamp) for m in setpoints if m.position])[-1:]) == {500_000_000}
+    assert abs(ns(setpoints[-1].header.stamp) - ns(live.outputs[-1].header.stamp)) < 5e9
+    stamps = {label: [] for label in dict.fromkeys(m.header.frame_id for m in live.outputs)}
+    for message in live.outputs:
+        stamps[message.header.frame_id].append(ns(message.header.stamp))
+    assert len(stamps) >= 3  # the beginning, our reset and the scenario's
+    assert all(set(np.diff(one)) <= {10_000_000} for one in stamps.values())
+    joined = [stamp for one in stamps.values() for stamp in one]
+    assert joined == sorted(set(joined))
+    assert not graph.node.get_publishers_info_by_topic("/clock")
+
+
+def test_with_use_sim_time_silence_counts_in_simulated_time(graph: Any) -> None:
+    """A simulator that pauses is not silent; one whose time goes on without an output is."""
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start("controller", output_timeout=0.1, use_sim_time=True)
+    clock, output = graph.publisher("/clock", Clock), graph.publisher("output", JointState)
+    now = Clock()
+    now.clock.sec = 5
+    graph.publish_until(clock, now, lambda: graph.fact("/controller", "stamp_ns", 0) == 5 * 10**9, what="its time")
+    message = JointState(position=[0.5], effort=[0.0])
+    for k in range(3):
+        message.header.stamp.nanosec = 1 + k
+        graph.publish_until(output, message, lambda k=k: len(efforts) > k, what="an answer")
+    began = time.monotonic()
+    graph.wait_until(lambda: time.monotonic() > began + 1.0)  # ten times the timeout, while the simulator pauses
+    assert "no output for" not in controller.log
+    now.clock.nanosec = 200_000_000
+    graph.publish_until(clock, now, lambda: "no output for 0.1 s" in controller.log, what="the silence")
+
+
+def ns(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def test_a_loop_slower_than_its_timeouts_is_not_silent(graph: Any) -> None:
@@ -106,7 +163,8 @@ def test_an_episode_in_realtime_begins_at_rest_where_its_plan_says(graph: Any) -
     graph.start("scenario", **quick, episodes=["held"], plan__held=["0 start 60", "6 disturbance 20", "16 end"])
     graph.wait_until(lambda: outputs[-1].position[0] > 61.0, what="the disturbance")
     began = next(i for i, m in enumerate(outputs) if m.position[0] == 60.0)
-    still = [m for m in outputs[began:] if m.position[0] < 60.1 and m.header.stamp.sec < 3]
+    until = ns(outputs[began].header.stamp) + 3 * 10**9
+    still = [m for m in outputs[began:] if m.position[0] < 60.1 and ns(m.header.stamp) < until]
     assert all(abs(m.position[0] - 60.0) < 1e-6 for m in still)
     at_rest = [m.effort[0] for m in efforts if m.header.frame_id.split()[-1] == outputs[began].header.frame_id]
     assert all(abs(effort - 50.0) < 1e-6 for effort in at_rest[: len(still) - 5])

@@ -1,18 +1,26 @@
-"""The plant in realtime: it steps on a steady timer and takes the newest effort."""
+"""The plant in realtime: it steps on a steady timer and takes the newest effort.
+
+Step k bears the stamp start + k·h in ROS time, from the tick that was due at the start, however late that came, and
+whatever happens to the wall clock.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.runtime.loop_end import patience_ns
+from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.qos import signal_qos
-from tdof_npid_ros.graph.runtime.realtime import LatestTimes
+from tdof_npid_ros.graph.runtime.realtime import LatestTimes, SteadyRosTime
 from tdof_npid_ros.plants.failsafe import FailSafe
 from tdof_npid_ros.wire import AnswerLabel, Sample
+
+CLOCK_PERIOD_NS = 10_000_000  # at least, of wall time, between two /clock messages
 
 
 class RealtimePlant:
@@ -25,19 +33,27 @@ class RealtimePlant:
         """Create the topics and the timer."""
         node = self._node
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
-        self.wall_period_ns = max(1, round(self._port.period_ns / node.values_of(["speed"])["speed"]))
+        p = node.values_of(["speed", "publish_clock"])
+        self.wall_period_ns = max(1, round(self._port.period_ns / p["speed"]))
+        self.start_ns = node.get_clock().now().nanoseconds  # the stamp of step 0
+        self.ros_time = SteadyRosTime(self.start_ns, STEADY.now().nanoseconds, p["speed"])
+        # At the speed of the wall clock, that is the clock; else time has to be told.
+        is_clock = p["publish_clock"] and p["speed"] != 1.0
+        self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10) if is_clock else None
+        self.clock_told_ns = 0
         self.reset()
         node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(), sole=True)
         node.subscribe_signal("disturbance", self._on_disturbance, signal_qos(1))
+        self.due_from_ns = STEADY.now().nanoseconds  # ticks are due whole periods after
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
 
     def reset(self) -> tuple[bool, str]:
-        """Back to the initial state, at time 0."""
+        """Back to the initial state; the next tick is step 0."""
         port = self._port
         label = port.next_label("")
         port.begin(label, port.new_simulator(label.number))
         self._start()
-        return True, "at the initial state, time 0"
+        return True, "at the initial state"
 
     def _start(self) -> None:
         lanes = self._port.simulator.lanes
@@ -58,7 +74,9 @@ class RealtimePlant:
     def _on_tick(self) -> None:
         node, now = self._node, STEADY.now().nanoseconds
         if self.first_tick_ns is None:
-            self.first_tick_ns = self.latest_tick_ns = now
+            self.first_tick_ns = now - (now - self.due_from_ns) % self.wall_period_ns  # when it was due
+            self.start_ns = self.ros_time.at(self.first_tick_ns)
+            self.latest_tick_ns = now
             self.missed_ticks = 0
         else:
             self._account_for_tick(now)
@@ -69,9 +87,14 @@ class RealtimePlant:
             self._port.simulator.advance(effort, self.disturbance)
             node.counts["steps"] += 1
             self.step += 1
-        time_ns = self.step * self._port.period_ns
-        self._port.publish_output(time_ns)
-        self.output_ns = time_ns, now
+        stamp_ns = self.start_ns + self.step * self._port.period_ns
+        self._port.publish_output(stamp_ns)
+        self.output_ns = stamp_ns, now
+        if self.clock_publisher is not None and now - self.clock_told_ns >= CLOCK_PERIOD_NS:
+            self.clock_told_ns = now
+            message = ClockMessage()
+            set_stamp(message.clock, stamp_ns)
+            self.clock_publisher.publish(message)
 
     def _account_for_tick(self, now: int) -> None:
         assert self.first_tick_ns is not None

@@ -6,6 +6,7 @@ import copy
 import functools
 import inspect
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -64,6 +65,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self.counts: Counter[str] = Counter()
         self.quiet_parameters: set[str] = set()  # changes of them are not logged: they come from a topic
         self.active = False
+        self.in_simulated_time = False  # `use_sim_time`
         self.activation_error: Exception | None = None
         self._why_inactive = "inactive: waits for its activation"
         self.endpoints = Endpoints(self, self.refuse)
@@ -113,6 +115,16 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
+
+    # Time
+
+    @property
+    def silence_ns(self) -> int | None:
+        """Time by which silence counts, ns: of a clock that is never set; or simulated time, which may stand still.
+
+        None: simulated time has not begun.
+        """
+        return (self.get_clock().now().nanoseconds or None) if self.in_simulated_time else time.monotonic_ns()
 
     # Topics
 
@@ -385,6 +397,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def _on_diagnostics_timer(self) -> None:
         if self.uses_events_executor:
             take_unread(self)
+        self.in_simulated_time = self.get_clock().ros_time_is_active
         self.endpoints.look()
         self.publish_diagnostics()
         collect_garbage()
@@ -396,6 +409,7 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         self._lasting = [id(entity) for _, entity in self._entities()]
         self._activating = True
         self._activation += 1
+        self.in_simulated_time = self.get_clock().ros_time_is_active
         try:
             self.activate()
         except Exception as error:  # rclpy would only go to an error state, without a word

@@ -1,4 +1,5 @@
-"""How a process keeps time: percentiles of the latest durations, and what the system allows a realtime loop."""
+"""How a process keeps time: ROS time that is never set, percentiles of the latest durations, and what the system allows
+a realtime loop."""
 
 from __future__ import annotations
 
@@ -10,6 +11,23 @@ import numpy as np
 
 LATEST = 4096  # durations that the percentiles are of
 PERCENTILES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+
+
+class SteadyRosTime:
+    """ROS time as it was at the beginning, going on with the steady clock: no setting of the wall clock moves it.
+
+    Args:
+        ros_ns, steady_ns: both clocks now, ns.
+        speed: times as fast as the steady clock.
+    """
+
+    def __init__(self, ros_ns: int, steady_ns: int, speed: float = 1.0) -> None:
+        self._ros_ns, self._steady_ns, self._speed = ros_ns, steady_ns, speed
+
+    def at(self, steady_ns: int) -> int:
+        """ROS time, ns, at a time of the steady clock."""
+        passed_ns = steady_ns - self._steady_ns
+        return self._ros_ns + (passed_ns if self._speed == 1.0 else round(passed_ns * self._speed))
 
 
 class LatestTimes:

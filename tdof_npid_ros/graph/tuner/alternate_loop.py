@@ -8,11 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
 from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
+from tdof_npid_ros.graph.runtime.node import LoopNode
 from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
 from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
@@ -46,7 +46,7 @@ class AlternateLoop:
 
     def __init__(
         self,
-        node: Node,
+        node: LoopNode,
         problem: TuningProblem,
         test: StepTest,
         namespace: str,
@@ -69,6 +69,7 @@ class AlternateLoop:
         self._integral_at_rest: float | None = None
         self._watching: Settling | Trial | None = None
         self._outputs = 0
+        self._first_ns: int | None = None  # the first output's stamp
         self._ended = threading.Event()
         self._setpoint_publisher = node.create_publisher(JointState, in_namespace(namespace, "setpoint"), SIGNAL_QOS)
         self._state_subscription = node.create_subscription(
@@ -190,19 +191,21 @@ class AlternateLoop:
 
     def _wait(self) -> None:
         """Until what is watched has ended; raises LoopLostError if no outputs come any more."""
-        seen, moved = self._outputs, time.monotonic()
+        seen, moved = self._outputs, self._node.silence_ns or 0
         while not self._ended.wait(POLL):
             self._check()
             if self._outputs != seen:
-                seen, moved = self._outputs, time.monotonic()
-            elif time.monotonic() - moved > self._answer_timeout:
+                seen, moved = self._outputs, self._node.silence_ns or 0
+            elif (self._node.silence_ns or 0) - moved > self._answer_timeout * 1e9:
                 raise LoopLostError(f"no output in {self._namespace} for {self._answer_timeout:g} s")
 
     def _on_output(self, message: JointState) -> None:
         if not message.position:
             return
         self._outputs += 1
-        now, output = stamp_ns(message.header.stamp) / 1e9, message.position[0]
+        stamp = stamp_ns(message.header.stamp)
+        self._first_ns = stamp if self._first_ns is None else self._first_ns
+        now, output = (stamp - self._first_ns) / 1e9, message.position[0]  # small, so that it is exact
         watching = self._watching
         if isinstance(watching, Trial):
             before = watching.setpoint
