@@ -114,6 +114,14 @@ TIMING: Final = (
         of_loop=True,
     ),
     Parameter(
+        "reliability",
+        "reliable",
+        "of what is taken: best_effort hears publishers that send so, too, and asks for no lost message again",
+        choices=("reliable", "best_effort"),
+        fixed=True,
+        of_loop=True,
+    ),
+    Parameter(
         "priority",
         0,
         "priority of SCHED_FIFO; 0: normal scheduling",

@@ -26,7 +26,7 @@ from tdof_npid_ros.control.session import FAR_IN_SIGMA, OFF_RATE, OUT_OF_STEP, S
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, shortened
-from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SENSOR_QOS, SIGNAL_QOS, signal_qos
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SENSOR_QOS, SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
@@ -108,10 +108,10 @@ class ControllerNode(LoopEnd):
         self.state_publisher = self.publisher_of(JointState, "controller_state", SIGNAL_QOS)
         self.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         if self.setpoint_from is not None:
-            self.subscribe_fields(self.setpoint_from, self._on_setpoint, signal_qos(10))
+            self.subscribe_fields(self.setpoint_from, self._on_setpoint, self.requested_qos(10))
         else:
-            self.subscribe_signal("setpoint", self._on_setpoint, signal_qos(10))
-        self.subscribe_signal("manual_effort", self._on_manual_effort, signal_qos(1))
+            self.subscribe_signal("setpoint", self._on_setpoint, self.requested_qos(10))
+        self.subscribe_signal("manual_effort", self._on_manual_effort, self.requested_qos(1))
         self.effort_to_publishers = {
             topic: self.publisher_of(message_class(kind), topic, SIGNAL_QOS)
             for topic, (kind, _) in (self.effort_to.messages.items() if self.effort_to else ())
@@ -122,7 +122,7 @@ class ControllerNode(LoopEnd):
             self.output_publisher = self.publisher_of(JointState, "output", SIGNAL_QOS)
             self.subscribe_fields(self.output_from, self._on_output_from, SENSOR_QOS, sole=True)
         else:
-            self.subscribe_signal("output", self._on_output, self.requested_qos(), sole=True)
+            self.subscribe_signal("output", self._on_output, self.requested_qos(as_promised=True), sole=True)
         self.create_timer(SILENCE_LOOKS, self._look_for_silence, clock=STEADY)
 
     def deactivate(self) -> None:

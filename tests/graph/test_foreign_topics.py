@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,31 @@ def test_an_imu_drives_and_the_effort_goes_to_a_forward_command_controller(graph
     recorder.stop()
     account = verify(tmp_path / "bag")
     assert account.different == 0 and account.equal >= 20, account
+
+
+def test_best_effort_joint_states_drive_the_controller_and_what_is_lost_is_counted(graph: Any) -> None:
+    """A sensor's burst while the controller stands still: more than its socket holds, and nobody sends it again."""
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start("controller", type="pid", kp=2.0, setpoint=1.0, reliability="best_effort")
+    sensor = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    states, message = graph.publisher("output", JointState, sensor), JointState(position=[0.25])
+    message.header.stamp.sec = 5
+    graph.publish_until(states, message, lambda: efforts, what="an answer")
+    assert list(efforts[-1].effort) == [1.5]
+    assert graph.fresh_fact("/controller", "lost", "0") == "0"
+    controller.send(signal.SIGSTOP)
+    for _ in range(20_000):
+        message.header.stamp.nanosec += 10_000
+        states.publish(message)
+    controller.send(signal.SIGCONT)
+    graph.publish_until(states, message, lambda: int(graph.fact("/controller", "lost", 0)) > 1000, what="the losses")
+    assert "output: messages were lost on the way" in controller.log
+    message.header.stamp.nanosec += 10_000
+    stamp = message.header.stamp
+    graph.publish_until(states, message, lambda: efforts[-1].header.stamp == stamp, what="that it goes on")
 
 
 def test_without_a_header_the_stamp_is_the_time_of_sending(graph: Any) -> None:

@@ -11,7 +11,7 @@ from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.recorder.lossless import Log
 from tdof_npid_ros.graph.runtime.messages import plan_from_message, set_stamp
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
-from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, RECENT_QOS
+from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import AnswerLabel, Sample
@@ -34,7 +34,7 @@ class LockstepPlant:
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
-        node.subscribe_signal("control_effort", self._on_answer, RECENT_QOS, sole=True)
+        node.subscribe_signal("control_effort", self._on_answer, node.requested_qos(), sole=True)
         self.held = False  # an output waits for the log
         p = node.values_of(["lossless", "reply_timeout", "publish_clock"])
         self.log = Log(node, self._port.period_ns, self._on_log_grown) if p["lossless"] else None

@@ -15,7 +15,6 @@ from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.runtime.loop_end import patience_ns
 from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
-from tdof_npid_ros.graph.runtime.qos import signal_qos
 from tdof_npid_ros.graph.runtime.realtime import LatestTimes, SteadyRosTime
 from tdof_npid_ros.plants.failsafe import FailSafe
 from tdof_npid_ros.wire import AnswerLabel, Sample
@@ -42,8 +41,8 @@ class RealtimePlant:
         self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10) if is_clock else None
         self.clock_told_ns = 0
         self.reset()
-        node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(), sole=True)
-        node.subscribe_signal("disturbance", self._on_disturbance, signal_qos(1))
+        node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(as_promised=True), sole=True)
+        node.subscribe_signal("disturbance", self._on_disturbance, node.requested_qos(1))
         self.due_from_ns = STEADY.now().nanoseconds  # ticks are due whole periods after
         node.create_timer(self.wall_period_ns / 1e9, self._on_tick, clock=STEADY)
 

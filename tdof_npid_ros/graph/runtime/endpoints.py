@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import (
     QoSCompatibility,
     QoSProfile,
+    ReliabilityPolicy,
     qos_check_compatible,
 )
 
@@ -21,10 +22,10 @@ class Endpoints:
     """Watches the topics of one node.
 
     Args:
-        refuse: called with a count's name and a cause, for what is to be counted and logged once.
+        refuse: called with a count's name, a cause, and perhaps `times`, for what is to be counted and logged once.
     """
 
-    def __init__(self, node: Node, refuse: Callable[[str, str], None]) -> None:
+    def __init__(self, node: Node, refuse: Callable[..., None]) -> None:
         self._node = node
         self._refuse = refuse
         self._published: set[str] = set()
@@ -67,7 +68,11 @@ class Endpoints:
             if event.not_alive_count_change > 0:
                 self._refuse("publisher_not_alive", f"{topic}: its publisher is not alive any more")
 
+        def on_lost(event: Any) -> None:
+            self._refuse("lost", f"{topic}: messages were lost on the way", times=event.total_count_change)
+
         return SubscriptionEventCallbacks(
+            message_lost=on_lost,
             matched=self._on_change,
             incompatible_qos=self._on_change,
             liveliness=on_liveliness,
@@ -102,9 +107,11 @@ class Endpoints:
                     continue
                 compatible, _ = qos_check_compatible(offer.qos_profile, request.qos_profile)
                 if compatible == QoSCompatibility.ERROR:
+                    unreliable = offer.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
                     self.conflicts.append(
                         f"{topic}: {full_name(offer)} offers {described(offer.qos_profile)}, but {full_name(request)} "
                         f"requests {described(request.qos_profile)}: no message passes; give both the same"
+                        f"{', reliability:=best_effort here' if unreliable else ''}"
                     )
 
 

@@ -7,7 +7,7 @@ from rclpy.qos import QoSProfile
 
 from tdof_npid_ros.control.joints import all_within, fault_of
 from tdof_npid_ros.graph.runtime.node import LoopNode
-from tdof_npid_ros.graph.runtime.qos import RECENT, RECENT_QOS, signal_qos
+from tdof_npid_ros.graph.runtime.qos import RECENT, signal_qos
 from tdof_npid_ros.graph.runtime.realtime import prepare_for_realtime
 
 PATIENCE_PERIODS = 3  # without a signal: no silence yet, however slow the loop
@@ -36,10 +36,16 @@ class LoopEnd(LoopNode):
         p = self.values_of(["deadline", "lease"])
         return signal_qos(1000, p["deadline"] if with_deadline else 0.0, p["lease"])
 
-    def requested_qos(self) -> QoSProfile:
-        """Of the topic that is taken."""
-        p = self.values_of(["deadline", "lease", "request_deadline"])
-        return signal_qos(RECENT, p["deadline"], p["lease"]) if p["request_deadline"] else RECENT_QOS
+    def requested_qos(self, depth: int = RECENT, as_promised: bool = False) -> QoSProfile:
+        """Of a signal that is taken.
+
+        Args:
+            depth: how many messages wait for this node.
+            as_promised: with the deadline and the lease that are asked for, if they are.
+        """
+        p = self.values_of(["deadline", "lease", "request_deadline", "reliability"])
+        deadline, lease = (p["deadline"], p["lease"]) if as_promised and p["request_deadline"] else (0.0, 0.0)
+        return signal_qos(depth, deadline, lease, reliable=p["reliability"] == "reliable")
 
     def is_valid(self, topic: str, values: np.ndarray, lanes: int, largest: float) -> bool:
         """Whether a signal has one value for each of `lanes`, none beyond `largest`; else it is refused."""

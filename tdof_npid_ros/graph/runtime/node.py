@@ -367,9 +367,9 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             self._warned.add(text)
             self.get_logger().warning(one_line(text))
 
-    def refuse(self, count: str, cause: str, detail: str = "") -> None:
+    def refuse(self, count: str, cause: str, detail: str = "", times: int = 1) -> None:
         """Count something that was refused; the first time for each cause, log it with its detail."""
-        self.counts[count] += 1
+        self.counts[count] += times
         if cause not in self._warned:
             self._warned.add(cause)
             self.get_logger().warning(

@@ -6,9 +6,10 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 
-def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0) -> QoSProfile:
-    """Reliable, the latest `depth`; deadline and liveliness lease in s, 0 for none."""
-    profile = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0, reliable: bool = True) -> QoSProfile:
+    """The latest `depth`; deadline and liveliness lease in s, 0 for none."""
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    profile = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
     if deadline > 0:
         profile.deadline = Duration(nanoseconds=round(deadline * 1e9))
     if lease > 0:
@@ -19,6 +20,5 @@ def signal_qos(depth: int, deadline: float = 0.0, lease: float = 0.0) -> QoSProf
 
 SIGNAL_QOS = signal_qos(1000)
 RECENT = 20  # messages that wait for a late reader: enough that none is lost, too few to answer after a long stop
-RECENT_QOS = signal_qos(RECENT)
-SENSOR_QOS = QoSProfile(depth=RECENT, reliability=ReliabilityPolicy.BEST_EFFORT)  # hears reliable publishers, too
+SENSOR_QOS = signal_qos(RECENT, reliable=False)  # hears reliable publishers, too
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
