@@ -21,6 +21,7 @@ from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspe
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
 from tdof_npid_ros.plants.noise import largest_noise, noiseless
 from tdof_npid_ros.plants.ode import class_by_value, take_class
+from tdof_npid_ros.plants.per_lane import LanePlants, lane_plants
 from tdof_npid_ros.plants.plant import Plant
 from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
@@ -87,6 +88,19 @@ class Case:
         """The plant with some parameters changed."""
         return make_plant(self.model, {**self.plant_values, **changes})
 
+    def parameters(self, gains: Gains | None = None) -> dict[str, dict[str, Any]]:
+        """The case as a parameter file gives it, by node; with the case's gains, or others of one lane."""
+        period = {"sample_period": self.sample_period}
+        plain = PLAIN.as_dict()
+        options = {name: value for name, value in self.options.as_dict().items() if value != plain[name]}
+        plans = {f"plan.{name}": list(lines) for name, lines in self.episodes.items()}
+        return {
+            "plant": {**self.plant_values, "model": self.model, **period},
+            "controller": {**period, **(gains or self.gains).as_dict(), **options},
+            "scenario": {**period, "episodes": list(self.episodes), **plans},
+            "tuner": dict(self.search),
+        }
+
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """The plan of each episode.
@@ -130,8 +144,20 @@ class Case:
             moves.append(largest_move(signals.setpoint, first, self.options.turn))
         return max(moves)
 
-    def simulate(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
+    def lane_plants(self, episode: str, changes: Sequence[Mapping[str, Any]]) -> LanePlants:
+        """A plant of its own for each lane of an episode: the case's with these parameters changed.
+
+        Raises:
+            PlantError: a lane's plant cannot be made, or they are of different kinds.
+        """
+        own = [replace(self, plant_values={**self.plant_values, **changed}).plant_at for changed in changes]
+        return lane_plants(own, self.signals[episode], self.effort_limits)
+
+    def simulate(self, episode: str, gains: Gains | None = None, plants: LanePlants | None = None) -> loop.Trajectory:
         """Run an episode in process; gains for one lane or many, by default the case's.
+
+        Args:
+            plants: of the lanes, from `lane_plants`; None: all have the case's.
 
         Raises:
             PlanError: the case has no such episode.
@@ -141,17 +167,22 @@ class Case:
             raise PlanError(f"{self.name} has no episode {episode!r}: its scenario's episodes are {known}")
         gains, signals = gains or self.gains, self.signals[episode]
         if self.options.is_plain:
-            return loop.simulate(self.plant_at, gains, signals, self.effort_limits)
+            return loop.simulate(plants or self.plant_at, gains, signals, self.effort_limits)
+        if plants is not None:
+            raise self._not_the_law_alone("lanes with plants of their own run")
         return loop.simulate_operated(self.plant_at, gains, self.options, signals, self.effort_limits)
 
-    def integrals(self, episode: str, gains: Gains) -> loop.Integrals:
-        """Run an episode in process and keep only its integrals."""
+    def integrals(self, episode: str, gains: Gains, plants: LanePlants | None = None) -> loop.Integrals:
+        """Run an episode in process and keep only its integrals; arguments as for `simulate`."""
         if not self.options.is_plain:
-            raise GainsError(
-                f"{self.name}: tuning runs the law alone; take these out of the controller's parameters first: "
-                + ", ".join(name for name, value in self.options.as_dict().items() if value != PLAIN.as_dict()[name])
-            )
-        return loop.integrals(self.plant_at, gains, self.signals[episode], self.effort_limits)
+            raise self._not_the_law_alone("tuning runs")
+        return loop.integrals(plants or self.plant_at, gains, self.signals[episode], self.effort_limits)
+
+    def _not_the_law_alone(self, who: str) -> GainsError:
+        return GainsError(
+            f"{self.name}: {who} the law alone; take these out of the controller's parameters first: "
+            + ", ".join(name for name, value in self.options.as_dict().items() if value != PLAIN.as_dict()[name])
+        )
 
     def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:
         """Metrics of the episode `setpoint`: a step of the setpoint at its start, from the output there.
@@ -159,7 +190,11 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        y, setpoint, disturbance = self._response("setpoint", gains)
+        return self.setpoint_metrics(self._output("setpoint", gains))
+
+    def setpoint_metrics(self, y: np.ndarray) -> SetpointMetrics:
+        """Those of an output (steps + 1,) of the episode `setpoint`; raises as `setpoint_response`."""
+        setpoint, disturbance = self._held("setpoint")
         if np.isclose(setpoint, y[0]) or disturbance != 0.0:
             told = f"the setpoint is {setpoint:g} and the disturbance {disturbance:g}, the output begins at {y[0]:g}"
             raise _no_single_step(self, "setpoint", told)
@@ -171,29 +206,39 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        y, setpoint, _ = self._response("disturbance", gains)
+        return self.disturbance_metrics(self._output("disturbance", gains))
+
+    def disturbance_metrics(self, y: np.ndarray) -> DisturbanceMetrics:
+        """Those of an output (steps + 1,) of the episode `disturbance`; raises as `disturbance_response`."""
+        setpoint, _ = self._held("disturbance")
         if not np.isclose(setpoint, y[0], atol=1e-8 + self.noise_bound):
             raise _no_single_step(
                 self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
             )
         return disturbance_metrics(y, setpoint, self.sample_period, self.largest_move, self.options.turn)
 
-    def _response(self, episode: str, gains: Gains | None) -> tuple[np.ndarray, float, float]:
-        """The output (steps + 1,) of an episode of one lane; setpoint and disturbance that it holds from its start
-        on."""
+    def _output(self, episode: str, gains: Gains | None) -> np.ndarray:
+        """The output (steps + 1,) of an episode of one lane."""
         lanes = (gains or self.gains).lanes
         if lanes > 1:
             raise GainsError(
                 f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each"
             )
-        output = self.simulate(episode, gains).output[:, 0]
+        return self.simulate(episode, gains).output[:, 0]
+
+    def _held(self, episode: str) -> tuple[float, float]:
+        """Setpoint and disturbance that an episode holds from its start on.
+
+        Raises:
+            PlanError: it does not.
+        """
         signals = self.signals[episode]
         for name, values in (("setpoint", signals.setpoint), ("disturbance", signals.disturbance)):
             if np.any(values != values[0]):
                 raise _no_single_step(self, episode, f"the {name} changes after 0 s")
         if len(signals.segments) > 1:
             raise _no_single_step(self, episode, "the plant changes after 0 s")
-        return output, float(signals.setpoint[0]), float(signals.disturbance[0])
+        return float(signals.setpoint[0]), float(signals.disturbance[0])
 
 
 def _no_single_step(case: Case, episode: str, why: str) -> PlanError:

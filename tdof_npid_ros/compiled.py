@@ -31,6 +31,7 @@ _SOURCES = (
     "control/law.py",
     "plants/kernels.py",
     "plants/lanes.py",
+    "plants/per_lane.py",
     "plants/states.py",
 )
 
@@ -57,6 +58,11 @@ fused_multiply_add: Callable[[float, float, float], float] = intrinsic(_fused_mu
 def implementation_of(stub: Callable[..., Any]) -> Callable[[F], F]:
     """Decorate a function that picks, by the types of the arguments, what a call of `stub` compiles to."""
     return cast(Callable[[F], F], overload(stub, strict=False))
+
+
+def inlined_implementation_of(stub: Callable[..., Any]) -> Callable[[F], F]:
+    """As `implementation_of`, and it is always inlined."""
+    return cast(Callable[[F], F], overload(stub, strict=False, jit_options={"forceinline": True}))
 
 
 def entry_point(function: F) -> F:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.compiled import compiled, entry_point
+from tdof_npid_ros.compiled import compiled, entry_point, inlined_implementation_of
 from tdof_npid_ros.control.controller import Controller, rest_setpoint
-from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, Gains, GainsError
 from tdof_npid_ros.control.law import (
     COEFFICIENTS,
     Limits,
@@ -33,6 +33,7 @@ from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
 from tdof_npid_ros.plants.lanes import advance_bounded, applied
 from tdof_npid_ros.plants.noise import first_measured
+from tdof_npid_ros.plants.per_lane import LanePlants, has_own_delays, is_direct, keep_due, of_lane
 from tdof_npid_ros.plants.plant import PlantAt
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.start import plant_at_start
@@ -99,17 +100,20 @@ def joined(parts: Sequence[Integrals]) -> Integrals:
     return Integrals(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Integrals)))
 
 
-def simulate(plant_at: PlantAt, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Trajectory:
+Plants = PlantAt | LanePlants  # the plant of all lanes, or one for each
+
+
+def simulate(plants: Plants, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Trajectory:
     """Run one episode and keep its trajectory.
 
     Args:
-        plant_at: the plant for a set of changed parameters, for example `case.plant_at`.
-        gains: for one lane or many.
+        plants: the plant of all lanes for a set of changed parameters, for example `case.plant_at`; or each lane's own.
+        gains: for one lane or many; for one where there are more plants: all have them.
         signals: the sampled plan.
         effort_limits: the plant's own, after those of the controller.
     """
-    output, effort = np.empty((2, signals.steps + 1, gains.lanes))
-    _run(plant_at, gains, signals, effort_limits, output, effort)
+    output, effort = np.empty((2, signals.steps + 1, _lanes_of(plants, gains)))
+    _run(plants, gains, signals, effort_limits, output, effort)
     return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
 
 
@@ -143,28 +147,44 @@ def simulate_operated(
     return Trajectory(signals.time, signals.setpoint, signals.disturbance, output, effort)
 
 
-def integrals(plant_at: PlantAt, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Integrals:
+def integrals(plants: Plants, gains: Gains, signals: SampledPlan, effort_limits: tuple[float, float]) -> Integrals:
     """Run one episode and keep only its integrals; arguments as for `simulate`."""
-    nothing = np.empty((0, gains.lanes))
-    return _run(plant_at, gains, signals, effort_limits, nothing, nothing)
+    nothing = np.empty((0, _lanes_of(plants, gains)))
+    return _run(plants, gains, signals, effort_limits, nothing, nothing)
+
+
+def _lanes_of(plants: Plants, gains: Gains) -> int:
+    """How many lanes there are.
+
+    Raises:
+        GainsError: there are gains for another number of lanes than there are plants.
+    """
+    if not isinstance(plants, LanePlants):
+        return gains.lanes
+    if gains.lanes not in (1, plants.lanes):
+        raise GainsError(f"gains for {gains.lanes} lanes, but plants for {plants.lanes}: give one, or one per lane")
+    return plants.lanes
 
 
 def _run(
-    plant_at: PlantAt,
+    plants: Plants,
     gains: Gains,
     signals: SampledPlan,
     limits: tuple[float, float],
     output: np.ndarray,
     effort: np.ndarray,
 ) -> Integrals:
-    steps = signals.steps
+    steps, lanes = signals.steps, _lanes_of(plants, gains)
     c = coefficients(gains, signals.sample_period_ns / 1e9)
-    iae, finite, early, late, largest = np.zeros((5, gains.lanes))
-    for block in _blocks(gains):
-        bounds = limits_of(gains, block.start), conditional_integration(gains), limits
-        width = _width(block.stop - block.start)
+    iae, finite, early, late, largest = np.zeros((5, lanes))
+    for block in _blocks(gains, lanes):
+        bounds = limits_of(gains, min(block.start, gains.lanes - 1)), conditional_integration(gains), limits
+        width = _width(block.stop - block.start, isinstance(plants, LanePlants))
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
-        lane_rows, sums = _run_block_of(plant_at, gains, _padded(c[:, block], width), bounds, signals, y, u)
+        of_block = np.minimum(np.arange(block.start, block.start + width), block.stop - 1)
+        its = plants[of_block] if isinstance(plants, LanePlants) else plants
+        c_block = np.ascontiguousarray(c[:, np.minimum(of_block, gains.lanes - 1)])
+        lane_rows, sums = _run_block_of(its, gains, c_block, bounds, signals, y, u)
         iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
         if signals.rest is not None:
             before, half, whole = (sums[k][: block.stop - block.start] for k in (*signals.rest, steps + 1))
@@ -176,25 +196,21 @@ def _run(
     return Integrals(iae * h, finite / (steps + 1), early * h, late * h, largest)
 
 
-def _blocks(gains: Gains) -> Iterator[slice]:
+def _blocks(gains: Gains, lanes: int) -> Iterator[slice]:
     """Lanes that run at once: neighbours with the same limits."""
     low, high = (gains.per_lane(name) for name in LIMITS_PER_LANE)
     changes = 1 + np.flatnonzero((low[1:] != low[:-1]) | (high[1:] != high[:-1]))
-    for begin, end in pairwise([0, *changes.tolist(), gains.lanes]):
+    for begin, end in pairwise([0, *changes.tolist(), lanes]):
         for first in range(begin, end, LARGEST_BLOCK):
             yield slice(first, min(first + LARGEST_BLOCK, end))
 
 
-def _width(lanes: int) -> int:
-    return 1 if lanes == 1 else max(2 * VECTOR, -(-lanes // VECTOR) * VECTOR)
-
-
-def _padded(c: np.ndarray, width: int) -> np.ndarray:
-    return np.ascontiguousarray(c[:, np.minimum(np.arange(width), c.shape[1] - 1)])
+def _width(lanes: int, own_plants: bool) -> int:
+    return 1 if lanes == 1 and not own_plants else max(2 * VECTOR, -(-lanes // VECTOR) * VECTOR)
 
 
 def _run_block_of(
-    plant_at: PlantAt,
+    plants: Plants,
     gains: Gains,
     c: np.ndarray,
     bounds: _Bounds,
@@ -209,23 +225,27 @@ def _run_block_of(
         its late half does, and at the end.
     """
     width = c.shape[1]
-    plant = plant_at_start(plant_at, signals.start, signals.segments[0].plant, bounds[2], signals.identity)
-    initial = plant.initial_state
-    rows = _aligned_zeros(_X + len(initial), width)
+    initial, state, y_0, u_0 = _beginning(plants, signals, bounds[2], width)
+    own_rows = plants.own_rows() if isinstance(plants, LanePlants) else 0
+    rows = _aligned_zeros(_X + len(initial) + own_rows, width)
     rows[:COEFFICIENTS] = c
-    rows[_X:] = np.reshape(initial, (-1, 1))
-    y_0, u_0 = np.full(width, first_measured(plant)), np.full(width, plant.initial_effort)
+    rows[_X : _X + len(initial)] = state
+    rows[_V_OLD] = u_0
     if (rest := rest_setpoint(signals.start, y_0, u_0)) is not None:
         rows[_U_I : _Z + 1] = settled(c, gains, rest, y_0, u_0)
     ring: np.ndarray | None = None
     sums = {}
     inputs = signals.setpoint, signals.disturbance, signals.weight
     outputs = y.ravel(), u.ravel()
-    for segment in _with_rest_apart(signals):
-        sampled = plant_at(segment.plant).sampled(signals.sample_period_ns)
+    for segment, plan_segment in _with_rest_apart(signals):
+        sampled: Any
+        if isinstance(plants, LanePlants):
+            sampled, rows[_X + len(initial) :] = plants.sampled(plan_segment)
+        else:
+            sampled = plants(segment.plant).sampled(signals.sample_period_ns)
         if ring is None:
             ring = _aligned_zeros(sampled.delay + 2, width)
-            ring += plant.initial_effort
+            ring += u_0
         check_same_delay(sampled, len(ring))
         last = segment.last + (segment.last == signals.steps)  # the last output is answered too
         memory = rows.ravel(), ring.ravel()
@@ -240,13 +260,26 @@ def _run_block_of(
     return rows, sums
 
 
-def _with_rest_apart(signals: SampledPlan) -> Iterator[Segment]:
-    """The plan's segments, the last of them cut where its rest begins and where the late half of that does."""
+def _beginning(
+    plants: Plants, signals: SampledPlan, limits: tuple[float, float], width: int
+) -> tuple[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """How a block of lanes begins: one lane's state, all states, (states, width) or (states, 1), the first outputs as
+    they are measured, and the efforts that were on before, (width,)."""
+    if isinstance(plants, LanePlants):
+        return plants.like, plants.state, plants.measured, plants.effort
+    plant = plant_at_start(plants, signals.start, signals.segments[0].plant, limits, signals.identity)
+    initial, effort = plant.initial_state, np.full(width, plant.initial_effort)
+    return initial, np.reshape(initial, (-1, 1)), np.full(width, first_measured(plant)), effort
+
+
+def _with_rest_apart(signals: SampledPlan) -> Iterator[tuple[Segment, int]]:
+    """The plan's segments, the last of them cut where its rest begins and where the late half of that does; and the
+    first step of the plan's segment that each belongs to."""
     *before, final = signals.segments
-    yield from before
+    yield from ((segment, segment.first) for segment in before)
     cuts = [k for k in signals.rest or () if k > final.first]
     for first, last in pairwise([final.first, *cuts, final.last]):
-        yield Segment(first, last, final.plant)
+        yield Segment(first, last, final.plant), final.first
 
 
 def _aligned_zeros(rows: int, width: int) -> np.ndarray:
@@ -337,16 +370,17 @@ def _run_block(
         d = disturbance[k]
         oldest = _next_slot(new, size)
         due = _next_slot(oldest, size)
-        _copy_row(ring, oldest, rows, np.uint64(_V_OLD), lanes)
-        _copy_row(ring, due, rows, np.uint64(_V_DUE), lanes)
+        _take_due(plant, ring, (new, oldest, due, size), rows, lanes)
         for j in range(w):
             x = loaded(x, rows, _X * w + j, w)
+            own = of_lane(plant, rows, (_X + len(x)) * w + j, w)
             c = lane_coefficients(rows, j, w)
             y, u, v, rows[_U_I * w + j], rows[_Z * w + j] = answered(
-                plant, x, rows[_U_I * w + j], rows[_Z * w + j], c, bounds, r, d
+                own, x, rows[_U_I * w + j], rows[_Z * w + j], c, bounds, r, d
             )
-            v_due = v if plant.delay == 0 else rows[_V_DUE * w + j]
-            x = advance_bounded(plant, x, rows[_V_OLD * w + j], v_due, d)
+            v_due = v if is_direct(plant, rows, (_X + len(x)) * w + j) else rows[_V_DUE * w + j]
+            x = advance_bounded(own, x, rows[_V_OLD * w + j], v_due, d)
+            keep_due(plant, rows, _V_OLD * w + j, v_due)
             rows[_V * w + j] = v
             store(x, rows, _X * w + j, w)
             error = abs(r - y)
@@ -360,6 +394,34 @@ def _run_block(
             _copy_row(rows, np.uint64(_Y), y_out, k, lanes)
             _copy_row(rows, np.uint64(_U), u_out, k, lanes)
         new = oldest
+
+
+def _take_due(plant: Any, ring: Any, slots: Any, rows: Any, lanes: Any) -> Any:
+    """Write what enters the plants at this step to the lanes' rows: what was put into the dead time's begin `delay`
+    samples ago, and one more; the latter is there already where lanes have dead times of their own."""
+
+
+@inlined_implementation_of(_take_due)
+def _take_due_of(plant: Any, ring: Any, slots: Any, rows: Any, lanes: Any) -> Any:
+    if has_own_delays(plant):
+        return _gather_due
+    return _copy_due
+
+
+def _copy_due(plant: Any, ring: Any, slots: Any, rows: Any, lanes: Any) -> None:
+    _, oldest, due, _ = slots
+    _copy_row(ring, oldest, rows, np.uint64(_V_OLD), lanes)
+    _copy_row(ring, due, rows, np.uint64(_V_DUE), lanes)
+
+
+def _gather_due(plant: Any, ring: Any, slots: Any, rows: Any, lanes: Any) -> None:
+    new, _, _, size = slots
+    delays, w = plant.delays, len(lanes)
+    now, turn = np.int64(new), np.int64(size)
+    for j in range(w):
+        slot = now - delays[j]
+        slot = slot + turn if slot < 0 else slot
+        rows[_V_DUE * w + j] = ring[slot * w + j]
 
 
 @compiled

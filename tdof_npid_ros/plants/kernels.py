@@ -73,7 +73,9 @@ class SampledNoisy(NamedTuple):
 
 def kernel_for(plant: Any, entry: Any) -> Any:
     """The entry point to call with a plant: as it is, or uncached for a user's own plant."""
-    inner = plant.plant if isinstance(plant, SampledNoisy) else plant
+    inner = plant
+    while hasattr(inner, "plant"):  # noisy, or one of many lanes'
+        inner = inner.plant
     return uncached(entry) if isinstance(inner, SampledOde) else entry
 
 
@@ -151,54 +153,55 @@ def runge_kutta(plant: Any, x: Any, u: Any, d: Any, step: Any) -> Any:
     return runge_kutta_mean(x, step, k1, k2, k3, k4)
 
 
-def _is(plant: Any, kind: type) -> bool:
+def is_sampled(plant: Any, kind: type) -> bool:
+    """Whether a plant's type, as Numba knows it, is that of a named tuple."""
     return isinstance(plant, types.BaseNamedTuple) and plant.instance_class is kind
 
 
 @implementation_of(plant_output)
 def _plant_output(plant: Any, x: Any) -> Any:
-    if _is(plant, SampledNoisy):
+    if is_sampled(plant, SampledNoisy):
         return lambda plant, x: measured(
             plant_output(plant.plant, x[:-2]), plant.noise, plant.quantum, plant.seed, x[-2], x[-1]
         )
-    if _is(plant, SampledOde):
+    if is_sampled(plant, SampledOde):
         return lambda plant, x: plant.output(x, plant.parameters)
     return lambda plant, x: x[0]
 
 
 @implementation_of(plant_input)
 def _plant_input(plant: Any, u: Any, d: Any) -> Any:
-    if _is(plant, SampledNoisy):
+    if is_sampled(plant, SampledNoisy):
         return lambda plant, u, d: plant_input(plant.plant, u, d)
-    if _is(plant, SampledLinear) or _is(plant, SampledOffset):
+    if is_sampled(plant, SampledLinear) or is_sampled(plant, SampledOffset):
         return lambda plant, u, d: u + d
     return lambda plant, u, d: u
 
 
 @implementation_of(plant_derivative)
 def _plant_derivative(plant: Any, x: Any, u: Any, d: Any) -> Any:
-    if _is(plant, SampledSprott):
+    if is_sampled(plant, SampledSprott):
         return sprott_derivative
     return lambda plant, x, u, d: plant.derivative(x, u, d, plant.parameters)
 
 
 @implementation_of(plant_advance)
 def _plant_advance(plant: Any, x: Any, v_old: Any, v_new: Any, d: Any) -> Any:
-    if _is(plant, SampledNoisy):
+    if is_sampled(plant, SampledNoisy):
         return lambda plant, x, v_old, v_new, d: (
             *plant_advance(plant.plant, x[:-2], v_old, v_new, d),
             x[-2] + 1.0,
             x[-1],
         )
-    if _is(plant, SampledLinear):
+    if is_sampled(plant, SampledLinear):
         return lambda plant, x, v_old, v_new, d: linear_map(
             plant.phi, x, plant.gamma_old, v_old, plant.gamma_new, v_new
         )
-    if _is(plant, SampledOffset):
+    if is_sampled(plant, SampledOffset):
         return lambda plant, x, v_old, v_new, d: along(
             linear_map(plant.phi, x, plant.gamma_old, v_old, plant.gamma_new, v_new), plant.constant, 1.0
         )
-    if _is(plant, SampledSprott):
+    if is_sampled(plant, SampledSprott):
         return lambda plant, x, v_old, v_new, d: runge_kutta(plant, x, v_new, d, plant.step)
     return _ode_advance
 
