@@ -33,6 +33,17 @@ def check_outputs(outputs: Sequence[Path], inputs: Sequence[Path] = ()) -> None:
         check_writable(path)
 
 
+def new_folder(path: Path) -> Path:
+    """The path of a folder that is not there yet.
+
+    Raises:
+        OutputError: it is.
+    """
+    if path.exists():
+        raise OutputError(f"{path} exists already and is not overwritten: choose another folder")
+    return path
+
+
 _held: dict[Path, IO[str]] = {}  # locks of this process
 
 

@@ -195,10 +195,54 @@ OPTIONS: Final = table(
     Parameter("angle", False, "true: setpoint and output are angles in rad, the error is the shorter way round"),
     Parameter("bumpless", True, "true: changes of gains and type do not move the effort at once"),
 )
+EXPERIMENT: Final = table(
+    Parameter("experiment", "", "name of the experiment that has the loop; empty: none, and all is as before"),
+    Parameter(
+        "experiment_setpoint",
+        math.inf,
+        "setpoint that the experiment gives; inf: the operator's",
+        "the output's unit",
+        Range(-LARGEST_SIGNAL),
+    ),
+    Parameter(
+        "experiment_effort",
+        math.inf,
+        "effort that the experiment gives by hand; inf: the mode of before",
+        "the effort's unit",
+        Range(-1e300),
+    ),
+    Parameter(
+        "experiment_lease",
+        2.0,
+        "wall time after which an experiment ends if none of its parameters is set again",
+        "s",
+        Range(0.1, 3600.0),
+    ),
+    Parameter(
+        "experiment_duration", 3600.0, "an experiment ends after so much of the loop's time", "s", Range(0.0, 1e9)
+    ),
+    Parameter(
+        "safe_range.output",
+        [-math.inf, math.inf],
+        "an experiment ends when the output leaves it",
+        "the output's unit",
+        length=2,
+        is_interval=True,
+    ),
+    Parameter(
+        "safe_range.effort",
+        [-math.inf, math.inf],
+        "an experiment ends before the effort leaves it",
+        "the effort's unit",
+        length=2,
+        is_interval=True,
+    ),
+)
 CONTROLLER: Final = table(
     SAMPLE_PERIOD,
     *GAINS.values(),
     *OPTIONS.values(),
+    *EXPERIMENT.values(),
     Parameter("setpoint", 0.0, "until one arrives on the topic", "the output's unit", SIGNAL, per_lane=True),
     Parameter("hold_output", False, "true: when activated, the setpoint is the first output, until another is given"),
     Parameter(

@@ -96,20 +96,29 @@ class LoopClient:
 
 
 @contextmanager
+def observed(namespace: str) -> Iterator[LoopObserver]:
+    """A loop that runs, seen and steered through ROS 2 alone."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    from tdof_npid_ros.graph.observer import LoopObserver
+
+    observer = LoopObserver(namespace)
+    try:
+        yield observer
+    finally:
+        observer.close()
+
+
+@contextmanager
 def client_of(arguments: argparse.Namespace) -> Iterator[LoopClient]:
     """A client of the loop that the arguments name.
 
     Raises:
         RuntimeError: none of that name answers, or it refuses what is asked; the message says what to do.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    from tdof_npid_ros.graph.observer import LoopObserver
-    from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError
+    with observed(arguments.namespace) as observer:
+        from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError
 
-    observer = LoopObserver(arguments.namespace)
-    try:
-        yield LoopClient(observer)
-    except NoAnswerError as error:
-        raise RuntimeError(f"{error}: start the loop, or name the one that runs, as --namespace /live") from error
-    finally:
-        observer.close()
+        try:
+            yield LoopClient(observer)
+        except NoAnswerError as error:
+            raise RuntimeError(f"{error}: start the loop, or name the one that runs, as --namespace /live") from error

@@ -6,13 +6,14 @@ through the same decisions about where a loop begins, so what the one computed t
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from tdof_npid_ros.control.controller import Controller, rest_setpoint
 from tdof_npid_ros.control.gains import LARGEST_SIGNAL
+from tdof_npid_ros.control.guard import Guard
 from tdof_npid_ros.control.joints import Joints, fault_of, name_joints
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import NO_VALUES, AnswerLabel, EpisodeLabel, Sample
@@ -248,6 +249,9 @@ class Session:
         silent: no output comes; the next one is joined.
         is_live: the loop goes on without waiting for answers: in realtime, and on a robot.
         is_out_of_step: the time between outputs is not the sample period.
+        guard: of an experiment on the loop.
+        end_experiment: called, with the reason, when the experiment must end at an output: it restores the parameters
+            and calls `go_back`, before the output is answered.
     """
 
     def __init__(self, controller: Controller, joints: Joints) -> None:
@@ -258,6 +262,8 @@ class Session:
         self.holds_output = False
         self.timeout_ns = 0
         self.saved_integral: np.ndarray | None = None
+        self.guard = Guard()
+        self.end_experiment: Callable[[str], None] = lambda why: None
         self.begin()
 
     def begin(self) -> None:
@@ -267,6 +273,7 @@ class Session:
         self.waiting: Sample | None = None
         self.silent = self.is_live = self.is_out_of_step = False
         self.answer: Answer | None = None
+        self._goes_back = False
         self._answer_label = AnswerLabel("")  # of the latest answer
         self._answered = NO_VALUES  # the latest output that was
         self._arrival_ns: int | None = None
@@ -328,6 +335,8 @@ class Session:
             why, detail = fault
             if len(y) > self.controller.lanes and not self.joints.names:
                 detail += name_joints(output.name)
+            if self.guard.name:
+                self.end_experiment(why + detail)
             return Outcome("refused", None, why, detail)
         place = Place(EpisodeLabel.parse(output.frame_id), output.stamp_ns)
         self.waiting = None
@@ -345,6 +354,11 @@ class Session:
             return Outcome("same", self.answer)
         if decision in ("late", "refused"):
             return Outcome(decision, None, why, detail)
+        if self.guard.name and (breach := self._breach(decision, y)):
+            self.end_experiment(breach)
+            setpoint = self._live_setpoint()
+        if self._goes_back and decision == "new":
+            decision = "join"
         follows_plan = place.label is not None and bool(place.label.plan)
         if decision != "new":
             self._measure_from(place)
@@ -357,7 +371,37 @@ class Session:
         self._answered, self._arrival_ns, self.silent, self._repeats = y, now_ns, False, 0
         applied = self._applied(output) if decision in ("join", "start") else None
         self._proceed(decision, place, setpoint, y, applied, self._take_saved(decision))
+        if self.guard.name and (breach := self.guard.breach_of_effort(self.controller.effort)):
+            self.end_experiment(breach)
+            applied = self._applied(output)
+            self._proceed("join", place, self._live_setpoint(), y, applied, self._take_saved("join"))
         return Outcome(decision, self.answer, why, detail, silent)
+
+    def _breach(self, decision: Decision, y: np.ndarray) -> str:
+        """Why the experiment must end at this output; empty: it need not."""
+        if decision != "new":
+            return "the loop has begun anew"
+        return self.guard.breach_of_output(y, self.controller.sample_period_ns)
+
+    def go_back(self) -> None:
+        """Answer the next output with the integral action of before the experiment, which has ended."""
+        self.saved_integral, self._goes_back = self.guard.integral, True
+
+    def check_experiment(self, changes: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+        """Refuse what an experiment cannot be, and one that cannot begin.
+
+        Args:
+            settings: the experiment's parameters as they would be.
+
+        Raises:
+            ValueError: the reason.
+        """
+        self.guard.check(changes, settings)
+        if not changes.get("experiment") or self.guard.name:
+            return
+        if self.answer is None or not self.is_live or self.silent:
+            raise ValueError("no experiment can begin: it needs a loop in realtime whose outputs come")
+        self.guard.check_begin(self._answered, self.controller.effort, settings)
 
     def _compare_periods(self, place: Place) -> tuple[str, str]:
         """In lockstep outputs come every sample period; if not, plant and controller were given different ones."""
@@ -406,7 +450,8 @@ class Session:
         """The setpoint for an output, (lanes,); None if its plan has not come."""
         label = place.label
         if label is None or not label.plan:
-            return self._live_setpoint()
+            given = self.guard.setpoint
+            return self._live_setpoint() if given is None else self._on_every_lane(given)
         if self.plan is None or self.plan.digest != label.plan:
             return None
         return self._on_every_lane(self.plan.value_at("setpoint", place.stamp_ns))
@@ -436,6 +481,7 @@ class Session:
     def _take_saved(self, decision: Decision) -> np.ndarray | None:
         if decision not in ("join", "start"):
             return None
+        self._goes_back = False
         saved, self.saved_integral = self.saved_integral, None
         return saved if saved is not None and len(saved) == self.controller.lanes else None
 

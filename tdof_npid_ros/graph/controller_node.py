@@ -30,7 +30,7 @@ from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SENSOR_QOS, SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.one_line import one_line
-from tdof_npid_ros.parameters import CONTROLLER, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
+from tdof_npid_ros.parameters import CONTROLLER, EXPERIMENT, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
 from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
 
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
@@ -52,6 +52,9 @@ class ControllerNode(LoopEnd):
         self.controller.warm_up()
         self.joints = Joints(given["joint_names"])
         self.session = Session(self.controller, self.joints)
+        self.session.end_experiment = self._end_experiment
+        if given["experiment"]:
+            raise ValueError("experiment must be empty at the start: set it once the loop runs")
         self._take_fields(given)
         self.commanded = False  # the topic gives the setpoint, since the activation
         self.checked(given)
@@ -127,6 +130,8 @@ class ControllerNode(LoopEnd):
 
     def deactivate(self) -> None:
         """Keep what outlasts an inactive time."""
+        if self.session.guard.name:
+            self._end_experiment("the controller was deactivated")
         if not self.values_of(["save_i_term"])["save_i_term"]:
             self.session.saved_integral = None
         elif self.controller.stamp_ns is not None:
@@ -154,6 +159,8 @@ class ControllerNode(LoopEnd):
             self.refuse("rejected", "setpoint refused", f": it {error}")
             return
         self.commanded = True
+        if self.session.guard.name:
+            self._end_experiment("an operator has given a setpoint")
         self.session.set_setpoint(r)
         if self.session.is_setpoint_far:
             self.warn_once(
@@ -239,10 +246,18 @@ class ControllerNode(LoopEnd):
             self.effort_publisher.publish(self._message(session.answer))
 
     def _look_for_silence(self) -> None:
+        guard = self.session.guard
+        if guard.name and (breach := guard.overdue(time.monotonic_ns(), self.session.silent)):
+            self._end_experiment(breach)
         if self.session.look_for_silence(self.silence_ns):
             self.counts["silences"] += 1
             silence = f"no output for {self.session.timeout_ns / 1e9:g} s: the integral action waits. "
             self.get_logger().error(STUCK if self.session.is_stuck else f"{silence}Look after the plant")
+
+    def _end_experiment(self, why: str) -> None:
+        """Restore all that was before the experiment, at once; as a change of parameters, like any."""
+        self.session.guard.note(why)
+        self.set_parameters_atomically([Parameter("experiment", value="")])
 
     # What goes out
 
@@ -265,9 +280,16 @@ class ControllerNode(LoopEnd):
         output = self.resolve_topic_name(self.output_from.topic if self.output_from else "output")
         return f"{gains.type}{joints}, {numbers}, {rate:g} Hz, waiting for {output}"
 
+    def completed(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """With what an experiment sets or restores together with them."""
+        if not self.session.guard.name and not changes.get("experiment"):
+            return changes
+        return self.session.guard.completed(changes, self.values_of([*GAINS, *OPTIONS]))
+
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         gains, _ = self._configured(changes)
+        self.session.check_experiment(changes, {**self.values_of(list(EXPERIMENT)), **changes})
         if not self.sigma_is_given and "sigma" not in changes:
             _check_sigma(gains.type, "")
         if "setpoint" in changes and self.commanded and not self._is_setpoint_of_now(changes["setpoint"]):
@@ -294,6 +316,16 @@ class ControllerNode(LoopEnd):
             self.session.set_setpoint(np.atleast_1d(changes["setpoint"]))
         if "output_timeout" in changes:
             self.session.timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
+        if "experiment" in changes or self.session.guard.name:
+            self._take_experiment(changes)
+
+    def _take_experiment(self, changes: dict[str, Any]) -> None:
+        guard, had = self.session.guard, self.session.guard.name
+        settings, now_ns = self.values_of(list(EXPERIMENT)), time.monotonic_ns()
+        if guard.take(changes, settings, self.controller.integral, now_ns):
+            self.session.go_back()
+        if had and not guard.name:
+            self.get_logger().warning(one_line(f"experiment {had} has ended, all is as before: {guard.why}"))
 
     def _is_setpoint_of_now(self, value: Any) -> bool:
         """Whether a value is that of the parameter as it stands, of a dump for one, or the setpoint as commanded."""
@@ -350,6 +382,8 @@ class ControllerNode(LoopEnd):
             return ERROR, one_line(self.why_refused) or stopped, facts
         if session.is_out_of_step:
             return ERROR, OFF_RATE if session.is_live else OUT_OF_STEP, facts
+        if session.guard.name:
+            return OK, one_line(f"experiment {session.guard.name} has the loop"), facts
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts

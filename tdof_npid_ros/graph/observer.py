@@ -21,6 +21,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
+from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.graph.runtime.messages import node_of, signal_message
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
@@ -42,7 +43,9 @@ class Row(NamedTuple):
     Attributes:
         time: s, of the loop; goes on where an episode begins again.
         episode: counts the episodes that were seen; 0 for the first.
-        setpoint, output, effort, applied: (lanes,); `applied` is empty where the plant tells none.
+        setpoint, output, effort, applied: (lanes,); `applied` is empty where the plant tells none. Of a robot's output,
+            the joints that the controller has.
+        stamp_ns: of the output.
     """
 
     time: float
@@ -51,6 +54,7 @@ class Row(NamedTuple):
     output: np.ndarray
     effort: np.ndarray
     applied: np.ndarray
+    stamp_ns: int
 
 
 @dataclass
@@ -88,7 +92,7 @@ class LoopObserver:
         self.nodes: dict[str, NodeState] = {}
         self._outputs: dict[int, Sample] = {}
         self._labels: dict[str, int] = {}
-        self._label = ""
+        self._label: str | None = None  # of the latest output; a robot may bear none
         self._base = self._last = 0.0  # s: when the present label came, and the latest answer
         self._began_ns = 0  # the label's first stamp
         self._latest_answer = 0.0
@@ -129,7 +133,9 @@ class LoopObserver:
     # What it hears
 
     def _take(self) -> list[Taken]:
-        return [message for tap in self._taps for message in tap.take()]
+        """Answers are taken before outputs but handed over after them, so that each one's output is there."""
+        taken = [tap.take() for tap in reversed(self._taps)]
+        return [message for messages in reversed(taken) for message in messages]
 
     def _hand_over(self, messages: list[Taken]) -> None:
         with self._lock:
@@ -158,15 +164,15 @@ class LoopObserver:
             self._labels[self._label] = len(self._labels)
         self._last = self._time_of(answer)
         self._latest_answer = time.monotonic()
+        y, applied = output.position, output.effort
+        if len(y) != len(answer.effort):
+            joints = Joints(answer.name)
+            try:
+                y, applied = joints.selected(output.name, y), joints.selected(output.name, applied)
+            except ValueError:
+                return  # another robot's
         self.rows.append(
-            Row(
-                self._last,
-                self._labels[self._label],
-                answer.position,
-                output.position,
-                answer.effort,
-                output.effort,
-            )
+            Row(self._last, self._labels[self._label], answer.position, y, answer.effort, applied, answer.stamp_ns)
         )
         self.count += 1
 

@@ -20,7 +20,7 @@ from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.graph.conductor import Conductor, LoopError
 from tdof_npid_ros.graph.processes import NodeProcesses
 from tdof_npid_ros.graph.runtime.middleware import stay_on_this_machine
-from tdof_npid_ros.output_file import OutputError
+from tdof_npid_ros.output_file import new_folder
 from tdof_npid_ros.parameter_file import find_parameter_file, read_parameters
 from tdof_npid_ros.parameters import MODE
 
@@ -174,8 +174,8 @@ def start_nodes(
     Raises:
         OutputError: the bag is there already.
     """
-    if bag is not None and bag.exists():
-        raise OutputError(f"{bag} exists already and is not overwritten: choose another folder")
+    if bag is not None:
+        new_folder(bag)
     mode = common.get("mode") or read_parameters(path, "plant").get("mode", MODE.default)
     lossless = {"lossless": bag is not None and mode == "lockstep"}
     own: dict[str, dict[str, Any]] = {

@@ -137,7 +137,7 @@ def _records(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
             continue
         time = (stamps[known] - stamps[known][0]) / 1e9
         before, limits = _from_plant(loop, int(receive[0]))
-        at_rest = label is not None and bool(known[0]) and (plan is None or stamps[0] == 0)
+        at_rest = label is not None and bool(known[0]) and stamps[0] == 0  # else it is met in the middle
         stretch = Stretch(
             time, effort[known], y[known], at_rest, before if at_rest else float(effort[known][0]), _is_even(time)
         )

@@ -93,6 +93,10 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
         """
         return status
 
+    def completed(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """A set of parameter changes, not checked yet, with what is to be set together with them."""
+        return changes
+
     def checked(self, changes: dict[str, Any]) -> None:
         """Check a set of parameter changes as a whole; raise ValueError, with the reason, to refuse it."""
 
@@ -328,13 +332,19 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
             self.get_logger().warning(warning)
 
     def _as_declared(self, parameters: list[RosParameter]) -> list[RosParameter]:
-        """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send."""
-        return [
+        """Whole numbers, and the word inf, for parameters that are floats: what `ros2 param set` and `load` send.
+
+        And what belongs to the changes: see `completed`.
+        """
+        declared = [
             RosParameter(parameter.name, value=as_float(plain(parameter.value)))
             if (its := self._parameters_known.get(parameter.name)) and its.kind is float
             else parameter
             for parameter in parameters
         ]
+        changes = {parameter.name: plain(parameter.value) for parameter in declared}
+        added = self.completed(changes)
+        return [*declared, *(RosParameter(name, value=added[name]) for name in added if name not in changes)]
 
     def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
         changes = {parameter.name: plain(parameter.value) for parameter in parameters}

@@ -1,0 +1,144 @@
+"""Experiments on somebody's node that gives `output` and takes `control_effort`: each way in which one is stopped."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tdof_npid_ros.analysis.verify import verify
+
+PERIOD = 0.01
+GAINS = {"kp": 2.0, "ki": 1.0, "kd": 0.0, "manual": False}
+
+
+class Robot:
+    """A first-order plant in the test's own process, which misbehaves when it is told to."""
+
+    def __init__(self, graph: Any) -> None:
+        from sensor_msgs.msg import JointState
+
+        self.graph = graph
+        self.y = self.u = 0.0
+        self.says: float | None = None  # in place of its output
+        self.silent = False
+        self._message = JointState()
+        self._publisher = graph.node.create_publisher(JointState, "/robot/output", 10)
+        graph.node.create_subscription(JointState, "/robot/control_effort", self._on_effort, 10)
+        self._efforts: list[float] = []
+        graph.node.create_timer(PERIOD, self._tick)
+
+    def _on_effort(self, message: Any) -> None:
+        self.u = message.effort[0]
+        self._efforts.append(self.u)
+
+    def _tick(self) -> None:
+        self.y += PERIOD * (self.u - self.y) / 0.5
+        if self.silent:
+            return
+        self._message.header.stamp = self.graph.node.get_clock().now().to_msg()
+        self._message.position = [self.y if self.says is None else self.says]
+        self._message.effort = [self.u]
+        self._publisher.publish(self._message)
+
+    def behave(self) -> None:
+        self.says, self.silent = None, False
+        self._efforts.clear()
+
+    def rests(self) -> bool:
+        return len(self._efforts) > 20 and abs(self.y - 1.0) < 0.02 and abs(self.u - 1.0) < 0.02
+
+
+def begin(graph: Any, name: str, **moves: Any) -> None:
+    values = {"experiment": name, "safe_range.output": [0.0, 2.0], "safe_range.effort": [-5.0, 5.0], **moves}
+    result = graph.set_parameters("/robot/controller", atomically=True, **values)[0]
+    assert result.successful, result.reason
+
+
+def is_as_before(graph: Any) -> bool:
+    names = ["experiment", "experiment_setpoint", "experiment_effort", *GAINS]
+    found = graph.get_parameters("/robot/controller", *names)
+    return found == ["", math.inf, math.inf, *GAINS.values()]
+
+
+def test_whatever_stops_an_experiment_all_is_as_before_and_verified(graph: Any, tmp_path: Path) -> None:
+    recorder = graph.start("recorder", namespace="/robot", bag=str(tmp_path / "bag"))
+    graph.wait_for_log(recorder, "ready", 60.0)
+    controller = graph.start(
+        "controller", namespace="/robot", type="tdof_npid2", kp=2.0, ki=1.0, sample_period=PERIOD, setpoint=1.0,
+        output_timeout=1.0, experiment_lease=5.0,
+    )  # fmt: skip
+    graph.wait_for_nodes("/robot/controller")
+    robot = Robot(graph)
+
+    def stopped(name: str, stop: Callable[[], Any], told: str, **moves: Any) -> None:
+        """Begin an experiment, stop it, and wait until all is as before and the loop at rest."""
+        graph.wait_until(robot.rests, 60.0, "rest")
+        begin(graph, name, kp=4.0, **moves)
+        with graph.expect_log(controller, f"experiment {name} has ended, all is as before: ", 30.0):
+            stop()
+        assert is_as_before(graph)
+        line = next(line for line in controller.log.splitlines() if f"experiment {name} has ended" in line)
+        assert told in line
+        robot.behave()
+        refused = graph.set_parameters("/robot/controller", atomically=True, experiment=name)[0]
+        assert not refused.successful and "has ended" in refused.reason  # a tool that is late does not begin it anew
+
+    moves = {"experiment_setpoint": 1.5}
+    by_hand = {"experiment_effort": 1.5}
+    stopped("range", lambda: setattr(robot, "says", 2.5), "output 2.5 is beyond safe_range.output", **by_hand)
+    stopped("nan", lambda: setattr(robot, "says", math.nan), "not finite", **moves)
+    stopped("silence", lambda: setattr(robot, "silent", True), "no output comes", **by_hand)
+    stopped(
+        "operator",
+        lambda: graph.set_parameters("/robot/controller", atomically=True, experiment=""),
+        "it was asked to end",
+        **by_hand,
+    )
+    stopped("lease", lambda: None, "experiment_lease", **moves, experiment_lease=0.5)
+
+    # The tool is killed, in the middle of moving the effort by hand.
+    graph.wait_until(robot.rests, 60.0, "rest")
+    tool = subprocess.Popen(
+        [sys.executable, "-m", "tdof_npid_ros", "experiment", "/robot", "--by", "effort", "--size", "0.2",
+         "--safe-output", "0", "2", "--bag", str(tmp_path / "tool")],
+        env=graph.environment, cwd=tmp_path,
+    )  # fmt: skip
+    try:
+        graph.wait_until(
+            lambda: math.isfinite(graph.get_parameters("/robot/controller", "experiment_effort")[0]), 60.0, "the tool"
+        )
+        assert graph.get_parameters("/robot/controller", "manual") == [True]
+    finally:
+        tool.send_signal(signal.SIGKILL)
+        tool.wait()
+    killed = time.monotonic()
+    graph.wait_until(lambda: is_as_before(graph), 30.0, "the lease's end")
+    assert time.monotonic() - killed < 10.0
+    graph.wait_until(robot.rests, 60.0, "rest")
+    controller.stop()
+    recorder.stop()
+    account = verify(tmp_path / "bag")
+    assert account.different == 0 and not account.unchecked
+    assert account.equal > 500
+
+
+def test_an_operators_setpoint_ends_an_experiment_and_holds(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+
+    controller = graph.start("controller", namespace="/robot", kp=2.0, ki=1.0, sample_period=PERIOD, setpoint=1.0)
+    graph.wait_for_nodes("/robot/controller")
+    robot = Robot(graph)
+    graph.wait_until(robot.rests, 60.0, "rest")
+    begin(graph, "step", experiment_setpoint=1.5, experiment_lease=30.0)
+    publisher = graph.publisher("/robot/setpoint", JointState)
+    with graph.expect_log(controller, "an operator has given a setpoint"):
+        graph.publish_until(publisher, JointState(position=[0.5]), lambda: "has ended" in controller.log)
+    graph.wait_until(lambda: robot.y == pytest.approx(0.5, abs=0.02), 60.0, "the operator's setpoint")
