@@ -145,15 +145,17 @@ class _Outputs:
     # In realtime
 
     def _check_applied(self, run: _Run) -> str:
-        """Each effort applied is a recorded one within the plant's limits, or the fallback."""
+        """Each effort applied is one that was recorded for an output before, within the plant's limits, or the
+        fallback."""
         if not self._sets:
             return NO_PLANT
         answers, output = self._loop.control_effort, self._output
         mine = self._labelled.get(run.label, [])
         if answers is None or not mine:
             return NO_EFFORT
-        recorded = [np.asarray(answers.effort[step], dtype=np.float64) for step in mine]
-        allowed: dict[int, set[bytes]] = {}
+        recorded = [(int(answers.stamp_ns[step]), np.asarray(answers.effort[step], dtype=np.float64)) for step in mine]
+        allowed: dict[int, dict[bytes, float]] = {}
+        is_start = True  # until the first effort
         for i in range(run.first, run.stop):
             applied = np.asarray(output.effort[i], dtype=np.float64)
             if not applied.size:
@@ -164,16 +166,18 @@ class _Outputs:
             for values in possible:
                 if id(values) not in allowed:
                     allowed[id(values)] = _allowed(values, recorded, applied.size)
-            if any(applied.tobytes() in allowed[id(values)] for values in possible):
+            stamp_ns, told = int(output.stamp_ns[i]), applied.tobytes()
+            is_start = is_start and any(told in _at_start(values, applied.size) for values in possible)
+            if is_start or any(allowed[id(values)].get(told, math.inf) < stamp_ns for values in possible):
                 self._account.note(APPLIED)
             elif self._lacks_some:
                 self._account.unchecked[NOT_ALL_EFFORTS] += 1
             elif any(_is_between(applied, values, recorded) for values in possible):
                 self._account.unchecked[GOING_OVER] += 1
             else:
-                told = ("a recorded control effort within the limits, or the fallback",)
+                wanted = ("a control effort recorded for an output before, within the limits, or the fallback",)
                 self._account.note(
-                    APPLIED, self._difference("applied effort", i, run.label, tuple(applied.tolist()), told, {})
+                    APPLIED, self._difference("applied effort", i, run.label, tuple(applied.tolist()), wanted, {})
                 )
         return ""
 
@@ -225,15 +229,25 @@ def _plant_maker(values: Values) -> PlantAt:
     return plant_at
 
 
-def _allowed(values: Values, recorded: list[np.ndarray], lanes: int) -> set[bytes]:
+def _at_start(values: Values, lanes: int) -> set[bytes]:
+    """What the plant applies before the first effort comes, by its bytes: none, limited or not, or one to rest with."""
     low, high = effort_limits(values)
-    fallback = float(values.get("fallback_effort", 0.0)) if values.get("fallback") == "effort" else 0.0
-    possible = [effort for effort in recorded if effort.size == lanes]
-    without = np.zeros(lanes)  # before the first effort, limited or not
-    further = (np.full(lanes, fallback), np.full(lanes, _resting_effort(values)), without)
-    return {without.tobytes()} | {
-        np.minimum(np.maximum(effort, low), high).tobytes() for effort in (*possible, *further)
-    }
+    without, resting = np.zeros(lanes), np.full(lanes, _resting_effort(values))
+    return {without.tobytes(), *(np.minimum(np.maximum(one, low), high).tobytes() for one in (without, resting))}
+
+
+def _allowed(values: Values, recorded: list[tuple[int, np.ndarray]], lanes: int) -> dict[bytes, float]:
+    """What the plant may apply then, by its bytes: with the first stamp that it answers, in ns; -inf for the
+    fallback."""
+    low, high = effort_limits(values)
+    fallback, effort = (values.get(name, PLANT[name].default) for name in ("fallback", "fallback_effort"))
+    always = [(-math.inf, np.full(lanes, float(effort)))] if fallback == "effort" else []
+    found: dict[bytes, float] = {}
+    for since, effort in (*always, *recorded):
+        if effort.size == lanes:
+            limited = np.minimum(np.maximum(effort, low), high).tobytes()
+            found[limited] = min(since, found.get(limited, math.inf))
+    return found
 
 
 def _resting_effort(values: Values) -> float:
@@ -246,11 +260,11 @@ def _resting_effort(values: Values) -> float:
         return 0.0
 
 
-def _is_between(applied: np.ndarray, values: Values, recorded: list[np.ndarray]) -> bool:
+def _is_between(applied: np.ndarray, values: Values, recorded: list[tuple[int, np.ndarray]]) -> bool:
     """Whether it lies between efforts, as where the plant goes over from its fallback to efforts that come again."""
     if not float(values.get("return_time", 0.0)) > 0 or not float(values.get("effort_timeout", 0.0)) > 0:
         return False
     low, high = effort_limits(values)
-    alike = np.array([*(effort for effort in recorded if effort.size == applied.size), np.zeros(applied.size)])
+    alike = np.array([*(effort for _, effort in recorded if effort.size == applied.size), np.zeros(applied.size)])
     alike = np.clip(alike, low, high)
     return bool(((applied >= alike.min(axis=0)) & (applied <= alike.max(axis=0))).all())

@@ -92,7 +92,7 @@ class LoopBag:
     def parameters(self, node: str, values: Mapping[str, Any]) -> None:
         self.write("/parameter_events", EVENT, parameter_event(self.namespace + node, values))
 
-    def configuration(self, case: Case, gains: Gains) -> None:
+    def configuration(self, case: Case, gains: Gains, **of_the_plant: Any) -> None:
         period = {"sample_period": case.sample_period}
         plant = {
             **{name: value for name, value in case.plant_values.items() if value != []},
@@ -100,7 +100,7 @@ class LoopBag:
             "lanes": gains.lanes,
         }
         plant |= {"effort_min": case.effort_limits[0], "effort_max": case.effort_limits[1]}
-        self.parameters("plant", {**plant, **period, "mode": "lockstep"})
+        self.parameters("plant", {**plant, **period, "mode": "lockstep", **of_the_plant})
         self.parameters("controller", {**gains.as_dict(), **case.options.as_dict(), **period})
         plans = {f"plan.{name}": list(lines) for name, lines in case.episodes.items()}
         self.parameters("scenario", {"episodes": list(case.episodes), **plans, **period})

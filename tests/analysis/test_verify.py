@@ -217,35 +217,53 @@ def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_pa
     assert verify.verify(tmp_path / "bag").equal == 300
 
 
+def realtime_bag(folder, case, step, applied, limit=2.0) -> None:
+    """Thirty outputs of a plant in realtime, that of `step` with another applied effort."""
+    limited = replace(case, effort_limits=(-limit, limit))
+    with LoopBag(folder) as bag:
+        bag.configuration(limited, case.gains, mode="realtime", fallback="effort", fallback_effort=0.25)
+        controller = Controller(case.gains, case.sample_period_ns)
+        before = 0.0
+        for k in range(30):
+            stamp, y = k * case.sample_period_ns, np.array([0.5 * np.sin(k / 10)])
+            told = applied(before) if k == step else before
+            bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
+            controller.answer(stamp, np.ones(1), y)
+            before = float(np.clip(controller.effort[0], -limit, limit))
+            answer = joint_state(stamp, f"{controller.digest} -/0011aabb.1", [1.0], controller.effort)
+            bag.write("control_effort", JOINT_STATE, answer)
+
+
 @pytest.mark.parametrize(
-    ("step", "applied", "status"),
+    ("applied", "status"),
     [
-        (50, None, 0),  # as it was
-        (50, 1e6, 1),  # never an effort
-        (50, -0.0, 1),  # one bit
-        (50, 2.0, 0),  # at the plant's limit, which an effort goes beyond
-        (50, 0.25, 0),  # the fallback
+        (lambda it: it, 0),
+        (lambda it: 1e6, 1),  # never an effort
+        (lambda it: 2.0, 0),  # at the plant's limit, which an effort went beyond
+        (lambda it: 0.25, 0),  # the fallback
     ],
 )
 def test_an_applied_effort_in_realtime_is_a_recorded_one_within_the_limits_or_the_fallback(
-    tmp_path, case, step, applied, status
+    tmp_path, case, applied, status
 ) -> None:
-    limited = replace(case, effort_limits=(-2.0, 2.0))
-    with LoopBag(tmp_path / "bag") as bag:
-        bag.configuration(limited, case.gains)
-        bag.parameters("plant", {"mode": "realtime", "fallback": "effort", "fallback_effort": 0.25})
-        controller = Controller(case.gains, case.sample_period_ns)
-        before = 0.0
-        for k in range(100):
-            stamp, y = k * case.sample_period_ns, np.array([0.5 * np.sin(k / 30)])
-            told = applied if k == step and applied is not None else before
-            bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
-            controller.answer(stamp, np.ones(1), y)
-            before = float(np.clip(controller.effort[0], -2.0, 2.0))
-            answer = joint_state(stamp, f"{controller.digest} -/0011aabb.1", [1.0], controller.effort)
-            bag.write("control_effort", JOINT_STATE, answer)
+    realtime_bag(tmp_path / "bag", case, 20, applied)
     account = verify.verify(tmp_path / "bag")
     assert account.status == status, account.lines()
+
+
+def test_every_flipped_bit_of_an_applied_effort_in_realtime_is_found(tmp_path, case) -> None:
+    for bit in range(64):
+        flip = lambda it: float((np.array(it).view(np.uint64) ^ np.uint64(1 << bit)).view(np.float64))  # noqa: B023, E731
+        realtime_bag(tmp_path / f"{bit}", case, 20, flip, 1e3)
+        assert verify.verify(tmp_path / f"{bit}").status == 1, bit
+
+
+def test_an_effort_is_not_applied_before_the_output_that_it_answers(tmp_path, case) -> None:
+    first: list[float] = []
+    realtime_bag(tmp_path / "bag", case, 25, lambda it: first.append(it) or it, 1e3)
+    assert verify.verify(tmp_path / "bag").status == 0
+    realtime_bag(tmp_path / "early", case, 20, lambda it: first[0], 1e3)
+    assert verify.verify(tmp_path / "early").status == 1
 
 
 def test_the_law_alone(tmp_path, case, capsys) -> None:

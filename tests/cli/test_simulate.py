@@ -1,6 +1,7 @@
 """`tdof-npid simulate` and the parameter files that it shares with the nodes."""
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -283,3 +284,23 @@ def test_no_metric_is_hidden_by_the_plants_unit(tmp_path: Path, capsys: pytest.C
         for episode, name in (("setpoint", "iae"), ("setpoint", "settling_time_s"), ("disturbance", "peak")):
             (value,) = [float(line[2]) for line in printed if line[:2] == [episode, name]]
             assert value == pytest.approx(report[episode][name], rel=1e-3)
+
+
+def test_a_turn_goes_the_short_way_and_its_iae_is_that_of_the_sampled_loop(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An integrator under u = 2 e at 100 Hz: e falls by 2 % each sample, along a line. The continuous loop has e0 / 2."""
+    path = tmp_path / "yaw.yaml"
+    path.write_text(
+        "/**:\n  ros__parameters: {sample_period: 0.01}\n"
+        "/**/plant:\n  ros__parameters: {model: transfer_function, numerator: [1.0], denominator: [1.0, 0.0]}\n"
+        "/**/controller:\n  ros__parameters: {type: pid, kp: 2.0, ki: 0.0, kd: 0.0, angle: true}\n"
+        "/**/scenario:\n  ros__parameters:\n    episodes: [setpoint]\n"
+        "    plan: {setpoint: ['0 setpoint 3.5', '10 end']}\n"
+    )
+    found = simulated(capsys, str(path), "--controller", "pid")
+    first = 2 * math.pi - 3.5
+    error = [first * 0.98**k for k in range(1001)]
+    exact = 0.01 * (sum(error) - (error[0] + error[-1]) / 2)
+    assert found["setpoint"]["iae"] == pytest.approx(exact, rel=1e-9)  # type: ignore[index]
+    assert exact == pytest.approx(0.99 * first / 2, rel=1e-6)

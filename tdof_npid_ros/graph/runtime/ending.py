@@ -1,8 +1,9 @@
-"""How a process ends though the middleware does not let go of it."""
+"""A node's process ends in time and with its status, even if the middleware hangs or aborts while it leaves."""
 
 from __future__ import annotations
 
 import ctypes
+import signal
 import sys
 import time
 
@@ -27,7 +28,9 @@ def end_within(seconds: float, status: int) -> None:
 
     For the time when all is in order but that the middleware is still to leave its domain. There Fast DDS may wait for
     itself for ever (its issues 6193 and 6502), on a thread that holds Python's interpreter lock, or when Python is gone
-    already; so it is the C library's timer that calls `_exit`. Without effect where there is no such timer.
+    already; so it is the C library's timer that calls `_exit`. And C++ may abort the process (a thread that still runs
+    when its object is destroyed): then the thread that aborts, after it has said why, waits for the timer. Without
+    effect where there is no such timer.
     """
     if sys.platform != "linux":
         return
@@ -39,3 +42,5 @@ def end_within(seconds: float, status: int) -> None:
     once = (ctypes.c_long * 4)(0, 0, whole, part)  # struct itimerspec
     if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
         library.timer_settime(timer, 0, once, None)
+        library.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
+        library.signal(signal.SIGABRT, ctypes.cast(library.pause, ctypes.c_void_p))
