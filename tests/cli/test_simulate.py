@@ -289,14 +289,14 @@ def test_no_metric_is_hidden_by_the_plants_unit(tmp_path: Path, capsys: pytest.C
 def test_a_turn_goes_the_short_way_and_its_iae_is_that_of_the_sampled_loop(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An integrator under u = 2 e at 100 Hz: e falls by 2 % each sample, along a line. The continuous loop has e0 / 2."""
+    """An integrator under u = 2 e at 100 Hz: e falls by 2 % each sample, along a line; in continuous time, IAE is e0/2."""
     path = tmp_path / "yaw.yaml"
     path.write_text(
         "/**:\n  ros__parameters: {sample_period: 0.01}\n"
         "/**/plant:\n  ros__parameters: {model: transfer_function, numerator: [1.0], denominator: [1.0, 0.0]}\n"
         "/**/controller:\n  ros__parameters: {type: pid, kp: 2.0, ki: 0.0, kd: 0.0, angle: true}\n"
-        "/**/scenario:\n  ros__parameters:\n    episodes: [setpoint]\n"
-        "    plan: {setpoint: ['0 setpoint 3.5', '10 end']}\n"
+        "/**/scenario:\n  ros__parameters:\n    episodes: [setpoint, disturbance]\n"
+        "    plan: {setpoint: ['0 setpoint 3.5', '10 end'], disturbance: ['0 disturbance 1', '10 end']}\n"
     )
     found = simulated(capsys, str(path), "--controller", "pid")
     first = 2 * math.pi - 3.5
