@@ -53,11 +53,19 @@ class ChunkCheckpoint:
         path: the file.
         work: all that the results depend on, as JSON holds it.
         resume: go on from the file if it is there; otherwise it must not be.
+        replace: a file that is of other work, or damaged, is replaced.
     """
 
     path: Path
     work: dict[str, Any]
     resume: bool = False
+    replace: bool = False
+
+    @property
+    def how_to_go_on(self) -> str:
+        """After an error."""
+        again = "run the same again" if self.replace else "run the same again with --resume"
+        return f", then {again}: {self.path} keeps what was done"
 
 
 class Workers(ABC):
@@ -115,10 +123,16 @@ class Workers(ABC):
                     for index, result in done:
                         results[index] = store.keep(index, result) if store else result
                         bar.update(sizes[index])
+            except WorkersError as error:
+                raise WorkersError(f"{error}{checkpoint.how_to_go_on if checkpoint else ''}") from None
             finally:
                 if store:
                     store.save()
         return [results[index] for index in range(len(chunks))]
+
+    def threads_in(self, chunks: int) -> int:
+        """How many threads each of so many chunks may use, that all cores have work and not much more than that."""
+        return 1
 
     @abstractmethod
     def _results(
@@ -176,6 +190,9 @@ class _Threads(Workers):
     def __init__(self, threads: int) -> None:
         self.cores = threads
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="chunk")
+
+    def threads_in(self, chunks: int) -> int:
+        return max(1, self.cores // max(1, chunks))
 
     def _results(
         self, function: Callable[[Shared, Chunk], Result], shared: Shared, chunks: dict[int, Chunk]
@@ -244,7 +261,7 @@ class _Cluster(Workers):
         except (CancelledError, OSError) as error:
             if isinstance(error, OSError) and self._client.status == "running":
                 raise  # the chunk's own
-            raise WorkersError(f"the Dask scheduler at {self._told} was lost") from None
+            raise WorkersError(f"the Dask scheduler at {self._told} was lost: start it again") from None
         except KilledWorker:
             raise WorkersError(
                 f"the same chunk ended its worker again and again (at {self._told}): have the workers memory enough?"
@@ -308,13 +325,16 @@ class _Store:
         self._work = {**checkpoint.work, "chunks": chunks, "program": program_digest()}
         self._plain: dict[str, Any] = {}
         self.results: dict[int, Any] = {}
+        self._unsaved, self._next_save = True, 0.0
         hold(path)
-        self._unsaved = not path.exists()
         if path.exists():
             if not checkpoint.resume:
                 raise CheckpointError(f"checkpoint {path} exists: resume it, or give another file")
-            self._restore()
-        self._next_save = 0.0
+            try:
+                self._restore()
+            except CheckpointError:
+                if not checkpoint.replace:
+                    raise
         self._save_if_due()
 
     def keep(self, index: int, result: Any) -> Any:
@@ -343,12 +363,13 @@ class _Store:
         if difference:
             raise CheckpointError(f"checkpoint {self._path} is of other work: {difference}")
         try:
-            self._plain = dict(content["results"])
-            self.results = {int(index): _from_json(plain) for index, plain in self._plain.items()}
+            plain = dict(content["results"])
+            self.results = {int(index): _from_json(one) for index, one in plain.items()}
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(
                 f"checkpoint {self._path} is damaged, start anew with another file: {one_line(error)}"
             ) from None
+        self._plain, self._unsaved = plain, False
 
 
 def _to_json(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import pickle
@@ -22,9 +23,12 @@ import pytest
 from tdof_npid_ros import workers as module
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.checkpoint import CheckpointError
+from tdof_npid_ros.cli import main
 from tdof_npid_ros.plants.ode import loaded_class, take_class
 from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.workers import ChunkCheckpoint, WorkersError, workers
+
+pytestmark = pytest.mark.timeout(300)  # processes load the program anew
 
 CASE = load_case("p1-c0.5")
 CHUNKS = [np.linspace(2.0, 20.0, 7) + 0.1 * chunk for chunk in range(16)]
@@ -145,6 +149,14 @@ def test_another_version_of_a_user_s_class_does_not_take_the_place_of_the_first(
     names = {take_class("tank:Tank", pickle.dumps(version)) for version in (dict, list)}
     assert len(names) == 2
     assert {loaded_class(name) for name in names} == {dict, list}
+
+
+def test_fronts_found_on_a_cluster_are_those_found_here(cluster: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    pareto = ["pareto", "--ratio", "0.5", "--controller", "npid", "pid", "--generations", "2", "--json"]
+    assert main(pareto) == main([*pareto, "--scheduler", cluster.scheduler_address]) == 0
+    here, there = capsys.readouterr().out.splitlines()
+    assert here == there
+    assert {point["controller"] for point in json.loads(here)["points"]} == {"npid", "pid"}
 
 
 def test_what_a_chunk_raises_is_raised_here(cluster: Any) -> None:

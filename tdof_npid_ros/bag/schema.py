@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 from tdof_npid_ros.bag.definition import SEPARATOR, is_nested, parse_fields
 from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.interfaces import InterfaceError, installed_file
+
+ROS2MSG: Final = "ros2msg"  # how definitions are written here
 
 
 def _interface_file(type_name: str, suffix: str) -> Path:
@@ -20,7 +23,7 @@ def _interface_file(type_name: str, suffix: str) -> Path:
 
 @cache
 def definition(type_name: str) -> str:
-    """Return the full definition of a type, all nested types included, as rosbag2 stores it (`ros2msg`).
+    """Return the full definition of a type, all nested types included, as rosbag2 stores it (`ROS2MSG`).
 
     Args:
         type_name: for example "sensor_msgs/msg/JointState".

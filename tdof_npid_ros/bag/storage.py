@@ -11,8 +11,8 @@ from tdof_npid_ros.bag.definition import Definition, parse
 from tdof_npid_ros.bag.errors import BagError, shown
 from tdof_npid_ros.bag.qos import QosProfile, qos_profiles
 from tdof_npid_ros.bag.scan import Table
+from tdof_npid_ros.bag.schema import ROS2MSG
 
-ROS2MSG: Final = "ros2msg"
 CDR_DEFINITIONS: Final = frozenset((ROS2MSG, "ros2idl", ""))  # how definitions of messages in CDR are written
 
 

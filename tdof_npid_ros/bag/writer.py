@@ -15,7 +15,7 @@ from tdof_npid_ros.bag import metadata, schema
 from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.bag.file_writer import COMPRESSIONS, FileWriter
 from tdof_npid_ros.bag.qos import QosProfile, qos_text
-from tdof_npid_ros.bag.storage import ROS2MSG
+from tdof_npid_ros.bag.schema import ROS2MSG
 
 CHUNK_BYTES: Final = 1 << 20  # a chunk is compressed and written when it holds this much
 FLUSH_INTERVAL_S: Final = 0.5  # so that a crash loses less than a second, the writing itself included

@@ -9,23 +9,25 @@ import math
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from tdof_npid_ros.cli.scheduler import add_scheduler_argument
 from tdof_npid_ros.cli.tune import add_constraint_arguments, constraints_of
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, controller_type
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType, controller_type
 from tdof_npid_ros.output_file import check_writable
-from tdof_npid_ros.paper.output import claim_folder
+from tdof_npid_ros.paper.output import claim_folder, kept_until_written
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.pareto import (
     GENERATIONS,
     RATIOS,
     Front,
+    FrontSearch,
+    chain_points,
+    chains_of,
     check_installed,
     foptd_case,
-    pareto_front,
-    poorer_of,
+    fronts_of,
 )
+from tdof_npid_ros.workers import ChunkCheckpoint, Workers, workers
 
 SUBCOMMAND = "pareto"
 
@@ -48,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write one point as a ROS parameter file (one --ratio and --controller)",
     )
     add_constraint_arguments(parser)
+    add_scheduler_argument(parser)
     selected = parser.add_mutually_exclusive_group()
     selected.add_argument("--index", type=int, metavar="N", help="of the point to write, by increasing IAE_SP")
     selected.add_argument(
@@ -68,26 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
         foptd_case(ratio)
     if arguments.out:
         claim_folder(arguments.out, SUBCOMMAND)
-    fronts: list[Front] = []
-    constraints = constraints_of(arguments)
-    searches = [(ratio, controller) for ratio in ratios for controller in controllers]
-    with tqdm(total=len(searches) * arguments.generations, unit="generation", leave=False, disable=None) as bar:
-        for ratio, controller in searches:
-            bar.set_description(f"L/T = {ratio:g}, {controller}")
-            fronts.append(
-                pareto_front(
-                    ratio,
-                    controller,
-                    seed=arguments.seed,
-                    generations=arguments.generations,
-                    constraints=constraints,
-                    poorer=poorer_of(fronts, ratio, controller),
-                    after_generation=bar.update,
-                )
-            )
+    search = FrontSearch(arguments.seed, arguments.generations, constraints_of(arguments))
+    with workers(arguments.scheduler) as where:
+        if arguments.out:
+            with kept_until_written(arguments.out, _work(search, ratios, controllers)) as checkpoint:
+                fronts = _find(search, ratios, controllers, where, checkpoint)
+                _write(fronts, arguments.out)
+        else:
+            fronts = _find(search, ratios, controllers, where)
     rows = [row for front in fronts for row in front.rows()]
-    if arguments.out:
-        _write(fronts, rows, arguments.out)
     if arguments.write:
         weight = 1.0 if arguments.weight is None else arguments.weight
         index = fronts[0].best(weight) if arguments.index is None else arguments.index
@@ -120,9 +112,38 @@ def _refuse_bad_arguments(arguments: argparse.Namespace, fronts: int) -> None:
     check_writable(path)
 
 
-def _write(fronts: list[Front], rows: list[dict[str, Any]], folder: Path) -> None:
+def _find(
+    search: FrontSearch,
+    ratios: list[float],
+    controllers: list[ControllerType],
+    where: Workers,
+    checkpoint: ChunkCheckpoint | None = None,
+) -> list[Front]:
+    """The fronts by ratio and type, in the order in which they were asked for."""
+    chains = chains_of(ratios, controllers)
+    search = search._replace(threads=where.threads_in(len(chains)))
+    sizes = [len(chain.controllers) for chain in chains]
+    points = where.map(chain_points, search, chains, unit="front", sizes=sizes, checkpoint=checkpoint)
+    fronts = fronts_of(chains, points)
+    return [fronts[ratio, controller] for ratio in ratios for controller in controllers]
+
+
+def _work(search: FrontSearch, ratios: list[float], controllers: list[ControllerType]) -> dict[str, Any]:
+    """What the fronts depend on, as JSON holds it."""
+    constraints = search.constraints.given if search.constraints else {}
+    return {
+        "fronts": ratios,
+        "controllers": controllers,
+        "seed": search.seed,
+        "generations": search.generations,
+        "constraints": constraints,
+    }
+
+
+def _write(fronts: list[Front], folder: Path) -> None:
     from tdof_npid_ros.paper.figures import draw_fronts
 
+    rows = [row for front in fronts for row in front.rows()]
     with (folder / "fronts.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from tdof_npid_ros.cli.scheduler import add_scheduler_argument
 from tdof_npid_ros.paper.output import claim_folder
 from tdof_npid_ros.paper.reproduce import SUBCOMMAND, Effort, Reproduction, reproduce
+from tdof_npid_ros.workers import workers
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="HGA runs per row; the best counts (default: 1)"
     )
+    add_scheduler_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -28,8 +31,9 @@ def run(arguments: argparse.Namespace) -> int:
     only = [] if arguments.only is None else [name.strip().lower() for name in arguments.only.split(",")]
     reproduction = Reproduction(only, Effort(seeds=arguments.seeds))
     claim_folder(arguments.out, SUBCOMMAND)
-    with tqdm(total=len(reproduction.jobs(arguments.out)), unit="job", leave=False, disable=None) as bar:
-        summary = reproduce(arguments.out, reproduction, lambda label: _show(bar, label))
+    jobs = len(reproduction.jobs(arguments.out))
+    with workers(arguments.scheduler) as where, tqdm(total=jobs, unit="job", leave=False, disable=None) as bar:
+        summary = reproduce(arguments.out, reproduction, where, lambda label: _show(bar, label))
     if arguments.json:
         print(json.dumps(summary))
     else:

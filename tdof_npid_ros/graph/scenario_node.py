@@ -13,8 +13,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.graph.plant.port import EPISODE
-from tdof_npid_ros.graph.runtime.messages import lane_names, plan_message, set_stamp, signal_message, stamp_ns
+from tdof_npid_ros.graph.runtime.messages import EPISODE, lane_names, plan_message, set_stamp, signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.node import OK, STEADY, WARN, LoopNode
 from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS

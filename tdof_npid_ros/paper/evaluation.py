@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 from tdof_npid_ros.case import Case, load_case
-from tdof_npid_ros.control.gains import PER_LANE, Gains
+from tdof_npid_ros.control.gains import PER_LANE, ControllerType, Gains
 from tdof_npid_ros.paper.tables import Published
-from tdof_npid_ros.tuning.problem import GENERATIONS
 from tdof_npid_ros.tuning.study import tune_case
 
 CONTROLLER_TITLES = {"pid": "PID", "npid": "NPID", "tdof_npid1": "TDOF-NPID1", "tdof_npid2": "TDOF-NPID2"}
@@ -90,29 +89,52 @@ def measure(case: Case, gains: Gains) -> Measured:
     )
 
 
-def evaluate_row(published: Published, seeds: int, generations: int = GENERATIONS) -> Row:
-    """One row: measured at the printed gains, and tuned with seeds 0 … seeds - 1.
+class RowSearch(NamedTuple):
+    """One run of the HGA for a row: its case and type, the seed, and whether sigma is tuned too."""
 
-    Args:
-        generations: of each HGA run.
-    """
-    case = paper_case(published.case)
-    results = [tune_case(case, published.controller, seed=seed, generations=generations) for seed in range(seeds)]
+    case: str
+    controller: ControllerType
+    seed: int
+    sigma_free: bool = False
+
+
+def searches_of(published: Published, seeds: int) -> list[RowSearch]:
+    """What is to be run for a row with seeds 0 … seeds - 1."""
     free = published.case in SIGMA_FREE_CASES and published.controller != "pid"
+    return [
+        RowSearch(published.case, published.controller, seed, sigma_free)
+        for sigma_free in ([False, True] if free else [False])
+        for seed in range(seeds)
+    ]
+
+
+def optimum(search: RowSearch, generations: int, threads: int | None = None) -> dict[str, float]:
+    """The gains that one run finds, and their `objective`."""
+    extra = ("sigma",) if search.sigma_free else ()
+    case = paper_case(search.case)
+    found = tune_case(case, search.controller, seed=search.seed, extra=extra, generations=generations, threads=threads)
+    return {**{name: getattr(found.gains, name) for name in PER_LANE}, "objective": found.objective}
+
+
+def evaluated_row(published: Published, optima: dict[RowSearch, dict[str, float]]) -> Row:
+    """One row: measured at the printed gains, and at the best that its searches found."""
+    case = paper_case(published.case)
+    own = {one: found for one, found in optima.items() if one[:2] == (published.case, published.controller)}
+    tuned, free = ([found for one, found in own.items() if one.sigma_free == kind] for kind in (False, True))
     return Row(
         published,
         measure(case, published_gains(published)),
-        measure(case, min(results, key=lambda result: result.objective).gains),
-        tuple(result.objective for result in results),
-        _sigma_free(published, case, range(seeds), generations) if free else None,
+        _best(published, tuned),
+        tuple(found["objective"] for found in tuned),
+        _best(published, free) if free else None,
     )
 
 
-def _sigma_free(published: Published, case: Case, seeds: Sequence[int], generations: int) -> Measured:
-    results = [
-        tune_case(case, published.controller, seed=seed, extra=("sigma",), generations=generations) for seed in seeds
-    ]
-    return measure(case, min(results, key=lambda result: result.objective).gains)
+def _best(published: Published, optima: list[dict[str, float]]) -> Measured:
+    best = min(optima, key=lambda found: found["objective"])
+    case = paper_case(published.case)
+    values = {name: best[name] for name in PER_LANE}
+    return measure(case, case.gains.with_values(type=published.controller, **values))
 
 
 def deviation_percent(ours: float | None, published: float | None) -> float | None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from tdof_npid_ros.output_file import OutputError, hold
+from tdof_npid_ros.workers import ChunkCheckpoint
 
 MARKER = ".tdof-npid"
+UNFINISHED = ".unfinished.json"
 
 
 def claim_folder(folder: Path, subcommand: str) -> Path:
@@ -28,6 +33,19 @@ def claim_folder(folder: Path, subcommand: str) -> Path:
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from error
     return folder
+
+
+@contextmanager
+def kept_until_written(folder: Path, work: dict[str, Any]) -> Iterator[ChunkCheckpoint]:
+    """Keep what is computed in the folder until all that is made of it is written: a run that was killed goes on there.
+
+    Args:
+        folder: claimed.
+        work: all that the results depend on, as JSON holds it; those of other work are thrown away.
+    """
+    checkpoint = ChunkCheckpoint(folder / UNFINISHED, work, resume=True, replace=True)
+    yield checkpoint
+    checkpoint.path.unlink(missing_ok=True)
 
 
 def _written_by(marker: Path) -> str:

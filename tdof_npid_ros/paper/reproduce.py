@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,35 @@ from tdof_npid_ros.paper.conclusions import (
     front_statements,
     reproduced,
 )
-from tdof_npid_ros.paper.evaluation import CONTROLLER_TITLES, Measured, Rows, evaluate_row
+from tdof_npid_ros.paper.evaluation import (
+    CONTROLLER_TITLES,
+    Measured,
+    Rows,
+    RowSearch,
+    evaluated_row,
+    optimum,
+    searches_of,
+)
 from tdof_npid_ros.paper.findings import findings
 from tdof_npid_ros.paper.items import ITEMS, Evaluated
-from tdof_npid_ros.paper.output import claim_folder
+from tdof_npid_ros.paper.output import claim_folder, kept_until_written
 from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
 from tdof_npid_ros.paper.report import Figure, Finding, Table
 from tdof_npid_ros.paper.robust import price_of_robustness
-from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, ROWS
+from tdof_npid_ros.paper.tables import CASE_TITLES, COMPARED, ROWS, Published
 from tdof_npid_ros.tuning.pareto import GENERATIONS as PARETO_GENERATIONS
-from tdof_npid_ros.tuning.pareto import RATIOS, Front, check_installed, pareto_front, poorer_of
+from tdof_npid_ros.tuning.pareto import (
+    RATIOS,
+    Front,
+    FrontChain,
+    FrontSearch,
+    chain_points,
+    chains_of,
+    check_installed,
+    fronts_of,
+)
 from tdof_npid_ros.tuning.problem import GENERATIONS
+from tdof_npid_ros.workers import ChunkCheckpoint, Workers
 
 TITLE = "Design of novel TDOF nonlinear PID controllers, reproduced"
 SUBCOMMAND = "reproduce"
@@ -120,21 +138,32 @@ class Reproduction:
         self.built: dict[str, Table | Figure] = {}
         self.findings: tuple[Finding, ...] = ()
 
+    @property
+    def work(self) -> dict[str, Any]:
+        """What the searches depend on, as JSON holds it."""
+        return {"reproduce": list(self.names), **asdict(self.effort)}
+
+    def search(self, where: Workers, checkpoint: ChunkCheckpoint | None = None) -> None:
+        """Run the searches, each a chunk of work."""
+        rows = self._published
+        chains = chains_of(RATIOS, CONTROLLER_TYPES) if self._needs_fronts else []
+        searches = [search for row in rows for search in searches_of(row, self.effort.seeds)]
+        chunks: list[FrontChain | RowSearch] = [*chains, *searches]
+        found = where.map(
+            _searched, (self.effort, where.threads_in(len(chunks))), chunks, unit="search", checkpoint=checkpoint
+        )
+        fronts = fronts_of(chains, found[: len(chains)])
+        self.fronts = [fronts[ratio, controller] for ratio in RATIOS for controller in CONTROLLER_TYPES if fronts]
+        optima = dict(zip(searches, found[len(chains) :], strict=True))
+        self.rows = {(row.case, row.controller): evaluated_row(row, optima) for row in rows}
+
     def jobs(self, folder: Path) -> list[tuple[str, Callable[[], None]]]:
-        """What is to be done, in order: each a label and a function.
+        """What is to be done with what the searches found, in order: each a label and a function.
 
         Args:
-            folder: where the files go; `reproduce` claims it.
+            folder: where the files go.
         """
-        cases = {case for name in self.names for case in ITEMS[name].cases}
         return [
-            *(self._row_job(index) for index, row in enumerate(ROWS) if row.case in cases),
-            *(
-                self._front_job(ratio, kind)
-                for ratio in RATIOS
-                for kind in range(len(CONTROLLER_TYPES))
-                if self._needs_fronts
-            ),
             ("evidence", self._find),
             *((name, lambda name=name: self._build(name, folder)) for name in self.names),
             ("page", lambda: self._write_page(folder)),
@@ -178,27 +207,14 @@ class Reproduction:
         return any(ITEMS[name].needs_fronts for name in self.names)
 
     @property
+    def _published(self) -> list[Published]:
+        """The paper's rows that are needed."""
+        cases = {case for name in self.names for case in ITEMS[name].cases}
+        return [row for row in ROWS if row.case in cases]
+
+    @property
     def _cases(self) -> list[str]:
         return list(dict.fromkeys(case for case, _ in self.rows))
-
-    def _row_job(self, index: int) -> tuple[str, Callable[[], None]]:
-        published = ROWS[index]
-
-        def evaluate() -> None:
-            row = evaluate_row(published, self.effort.seeds, self.effort.generations)
-            self.rows[published.case, published.controller] = row
-
-        return f"HGA: {CASE_TITLES[published.case]}, {CONTROLLER_TITLES[published.controller]}", evaluate
-
-    def _front_job(self, ratio: float, kind: int) -> tuple[str, Callable[[], None]]:
-        controller = CONTROLLER_TYPES[kind]
-
-        def search() -> None:
-            poorer = poorer_of(self.fronts, ratio, controller)
-            generations = self.effort.pareto_generations
-            self.fronts.append(pareto_front(ratio, controller, generations=generations, poorer=poorer))
-
-        return f"NSGA-II: L/T = {ratio:g}, {CONTROLLER_TITLES[controller]}", search
 
     def _find(self) -> None:
         self.findings = findings(self.rows) if self.rows else ()
@@ -284,20 +300,33 @@ def _named(rows: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def reproduce(folder: Path, reproduction: Reproduction, before_job: Progress = lambda _: None) -> dict[str, Any]:
-    """Compute and write everything; returns the summary.
+def reproduce(
+    folder: Path, reproduction: Reproduction, where: Workers, before_job: Progress = lambda _: None
+) -> dict[str, Any]:
+    """Compute and write everything; returns the summary. A run that was killed goes on where it was.
 
     Args:
-        before_job: called with each job's label, for a progress bar.
+        where: the searches run.
+        before_job: called with the label of each job after them, for a progress bar.
 
     Raises:
         OutputError: the folder holds other files, or cannot be written.
     """
     claim_folder(folder, SUBCOMMAND)
-    for label, job in reproduction.jobs(folder):
-        before_job(label)
-        job()
+    with kept_until_written(folder, reproduction.work) as checkpoint:
+        reproduction.search(where, checkpoint)
+        for label, job in reproduction.jobs(folder):
+            before_job(label)
+            job()
     return reproduction.summary(folder)
+
+
+def _searched(how: tuple[Effort, int], search: FrontChain | RowSearch) -> Any:
+    """A chunk of work: what one search finds."""
+    effort, threads = how
+    if isinstance(search, FrontChain):
+        return chain_points(FrontSearch(generations=effort.pareto_generations, threads=threads), search)
+    return optimum(search, effort.generations, threads)
 
 
 def _write_table(table: Table, folder: Path) -> None:

@@ -10,12 +10,12 @@ import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tdof_npid_ros.case import Case
-from tdof_npid_ros.control.gains import PER_LANE, ControllerType, Gains
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType, Gains
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.judge import Constraints
@@ -144,7 +144,7 @@ def pareto_front(
     generations: int = GENERATIONS,
     constraints: Constraints | None = None,
     poorer: Front | None = None,
-    after_generation: Callable[[], object] = lambda: None,
+    threads: int | None = None,
 ) -> Front:
     """The front that NSGA-II finds; the same one for the same arguments.
 
@@ -156,7 +156,7 @@ def pareto_front(
         seed: not negative.
         constraints: margins that each point must have; see `Judge` for what else it must be.
         poorer: the front of the type in `POORER`, which this type contains; found here if it is not given.
-        after_generation: called after each generation of NSGA-II, for a progress bar.
+        threads: by default one per core; the front does not depend on it.
 
     Raises:
         TuningError: an argument out of its range, no point that is allowed, or pymoo is not installed.
@@ -173,13 +173,14 @@ def pareto_front(
             population=population,
             generations=generations,
             constraints=constraints,
+            threads=threads,
         )
     case = foptd_case(ratio)
     problem = TuningProblem(
         case, controller, constraints=constraints, seed=seed, generations=max(LEAST_FOR_ENDS, generations // 4)
     )
-    objective, space = Objective(problem), problem.space
-    known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem), *(poorer.gains if poorer else ()))]
+    objective, space = Objective(problem, threads), problem.space
+    known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem, threads), *(poorer.gains if poorer else ()))]
     starts = np.reshape(known, (-1, len(problem.names)))
 
     def costs(candidates: Array) -> tuple[Array, Array]:
@@ -188,7 +189,7 @@ def pareto_front(
         measures = np.column_stack([objective_values(*pair, weight=0.0) for pair in pairs])
         return measures, scores(problem, candidates, setpoint, disturbance).violation
 
-    found = space.at(_nsga2(costs, space, space.of(starts), seed, population, generations, after_generation))
+    found = space.at(_nsga2(costs, space, space.of(starts), seed, population, generations))
     candidates = np.unique(np.concatenate([starts, found]), axis=0)
     iae, violation = costs(candidates) if len(candidates) else (np.empty((0, 2)), np.empty(0))
     candidates, iae = candidates[violation == 0.0], iae[violation == 0.0]
@@ -200,18 +201,68 @@ def pareto_front(
     return Front(case, controller, ratio, tuple(problem.gains(one) for one in candidates), iae)
 
 
+class FrontSearch(NamedTuple):
+    """How fronts are found: see `pareto_front`."""
+
+    seed: int = 0
+    generations: int = GENERATIONS
+    constraints: Constraints | None = None
+    threads: int | None = None
+
+
+class FrontChain(NamedTuple):
+    """Fronts of one ratio that are found one after the other, each from the one before."""
+
+    ratio: float
+    controllers: tuple[ControllerType, ...]
+
+
+def chains_of(ratios: Sequence[float], controllers: Sequence[ControllerType]) -> list[FrontChain]:
+    """The fronts of each ratio and controller type, in chains that are independent of each other; the longest first."""
+    nested = {*POORER, *POORER.values()}
+    kinds = [
+        tuple(one for one in CONTROLLER_TYPES if one in controllers and (one in nested) == wanted)
+        for wanted in (True, False)
+    ]
+    return [FrontChain(ratio, kind) for kind in kinds if kind for ratio in ratios]
+
+
+def chain_points(search: FrontSearch, chain: FrontChain) -> list[dict[str, Array]]:
+    """A chunk of work: of each front of a chain, `gains` (points, len(PER_LANE)) and `iae` (points, 2)."""
+    fronts: list[Front] = []
+    for controller in chain.controllers:
+        poorer = poorer_of(fronts, chain.ratio, controller)
+        fronts.append(pareto_front(chain.ratio, controller, poorer=poorer, **search._asdict()))
+    return [
+        {"gains": np.array([[getattr(gains, name) for name in PER_LANE] for gains in front.gains]), "iae": front.iae}
+        for front in fronts
+    ]
+
+
+def fronts_of(chains: Sequence[FrontChain], points: Sequence[list[dict[str, Array]]]) -> dict[tuple[float, str], Front]:
+    """The fronts of chains from what `chain_points` gave, by ratio and controller type."""
+    fronts: dict[tuple[float, str], Front] = {}
+    for chain, found in zip(chains, points, strict=True):
+        case = foptd_case(chain.ratio)
+        for controller, one in zip(chain.controllers, found, strict=True):
+            lanes = [dict(zip(PER_LANE, row, strict=True)) for row in one["gains"].tolist()]
+            gains = tuple(case.gains.with_values(type=controller, **lane) for lane in lanes)
+            fronts[chain.ratio, controller] = Front(case, controller, chain.ratio, gains, one["iae"])
+    return fronts
+
+
 def poorer_of(fronts: Sequence[Front], ratio: float, controller: ControllerType) -> Front | None:
     """Of fronts found with the same arguments, that of the type which this one contains, if it is there."""
     kind = POORER.get(controller)
     return next((front for front in fronts if (front.ratio, front.controller) == (ratio, kind)), None)
 
 
-def _ends(problem: TuningProblem) -> list[Gains]:
+def _ends(problem: TuningProblem, threads: int | None) -> list[Gains]:
     """The gains with the least IAE_SP, and with the least IAE_DIS, that the HGA finds."""
     ends = []
     for weight in (0.0, MOST_DISTURBANCE):
         study = Study(replace(problem, weight=weight))
-        study.run(Objective(study.problem))
+        study.run(Objective(study.problem, threads))
         if study.feasible:
             ends.append(study.result.gains)
     return ends
@@ -224,7 +275,6 @@ def _nsga2(
     seed: int,
     population: int,
     generations: int,
-    after_generation: Callable[[], object],
 ) -> Array:
     """The points [n, d] in 0 .. 1 that NSGA-II ends with.
 
@@ -232,9 +282,8 @@ def _nsga2(
         costs: both measures [n, 2] and the violations [n] of candidates [n, d].
         starts: [k, d] in 0 .. 1; half the population at most begins there.
     """
-    nsga2, problems, optimize, callback = (
-        importlib.import_module(name)
-        for name in (PYMOO_NSGA2, "pymoo.core.problem", "pymoo.optimize", "pymoo.core.callback")
+    nsga2, problems, optimize = (
+        importlib.import_module(name) for name in (PYMOO_NSGA2, "pymoo.core.problem", "pymoo.optimize")
     )
     dimension = space.lower.size
 
@@ -242,10 +291,6 @@ def _nsga2(
         def _evaluate(self, x: Array, out: dict[str, Array], *_: Any, **__: Any) -> None:
             out["F"], violation = costs(space.at(x))
             out["G"] = violation[:, None]
-
-    class Progress(callback.Callback):  # type: ignore[misc, name-defined]
-        def notify(self, _: Any) -> None:
-            after_generation()
 
     first = np.random.default_rng(seed).random((population, dimension))
     if len(starts):
@@ -256,7 +301,6 @@ def _nsga2(
         nsga2.NSGA2(pop_size=population, sampling=first),
         ("n_gen", generations),
         seed=seed,
-        callback=Progress(),
     )
     return np.empty((0, dimension)) if found.X is None else np.reshape(found.X, (-1, dimension))
 

@@ -220,12 +220,14 @@ def tune_case(
     population: int = POPULATION,
     generations: int = GENERATIONS,
     constraints: Constraints | None = None,
+    threads: int | None = None,
 ) -> TuningResult:
     """Tune one controller type on a case, in process, with the case's bounds and weight, from random gains.
 
     Args:
         extra: `("sigma",)` to free sigma too.
         constraints: margins that the loop must have; whether it has them, `feasible` says.
+        threads: by default one per core; the result does not depend on it.
 
     Raises:
         TuningError: see `TuningProblem`.
@@ -242,5 +244,5 @@ def tune_case(
         constraints=constraints or Constraints(),
     )
     study = Study(problem)
-    study.run(Objective(problem))
+    study.run(Objective(problem, threads))
     return study.result

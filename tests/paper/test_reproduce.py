@@ -15,7 +15,7 @@ from tdof_npid_ros.control.gains import CONTROLLER_TYPES
 from tdof_npid_ros.control.law import KD_H, PHI, coefficients
 from tdof_npid_ros.paper import findings
 from tdof_npid_ros.paper.conclusions import TOLERANCES
-from tdof_npid_ros.paper.evaluation import deviation_percent, evaluate_row, measure, paper_case, published_gains
+from tdof_npid_ros.paper.evaluation import deviation_percent, measure, optimum, paper_case, published_gains, searches_of
 from tdof_npid_ros.paper.inferred import OPTIMAL, as_stated, inferred, optimality
 from tdof_npid_ros.paper.items import ITEMS, SETTLED_AT, variation_metrics
 from tdof_npid_ros.paper.output import MARKER, OutputError, claim_folder
@@ -28,6 +28,7 @@ from tdof_npid_ros.paper.tuned import tuned
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
+from tdof_npid_ros.workers import workers
 
 QUICK = Effort(seeds=1, generations=3, pareto_generations=3)
 REPRODUCED_CASES = ("p1-c4", "p2-c2", "p2-c5")
@@ -38,7 +39,8 @@ PNG_SIGNATURE = b"\x89PNG"
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Reproduction]:
     folder = tmp_path_factory.mktemp("whole") / "out"
     reproduction = Reproduction(effort=QUICK)
-    reproduce(folder, reproduction)
+    with workers() as here:
+        reproduce(folder, reproduction, here)
     return folder, reproduction
 
 
@@ -108,9 +110,27 @@ def test_the_summary_says_for_every_row_whether_it_reproduces(whole: tuple[Path,
 
 def test_only_writes_what_is_asked_for(tmp_path: Path) -> None:
     reproduction = Reproduction(["figure1", "figure13"], QUICK)
-    reproduce(tmp_path / "out", reproduction)
+    with workers() as here:
+        reproduce(tmp_path / "out", reproduction, here)
     assert {path.stem for path in (tmp_path / "out").iterdir()} == {"figure1", "figure13", "index", "summary", MARKER}
     assert isinstance(reproduction.built["figure13"], Figure)
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: object) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr(Reproduction, "_find", lambda self: None)  # takes long, and is no search
+    with workers() as here:
+        with monkeypatch.context() as patched, pytest.raises(InterruptedError):
+            patched.setattr(Reproduction, "_build", killed)
+            reproduce(tmp_path / "out", Reproduction(["table6"], QUICK), here)
+        with monkeypatch.context() as patched:
+            patched.setattr("tdof_npid_ros.paper.reproduce.optimum", killed)
+            resumed = reproduce(tmp_path / "out", Reproduction(["table6"], QUICK), here)
+            with pytest.raises(InterruptedError):  # all is written, so nothing is kept any more
+                reproduce(tmp_path / "out", Reproduction(["table6"], QUICK), here)
+        assert reproduce(tmp_path / "out", Reproduction(["table6"], QUICK), here) == resumed
 
 
 def test_an_earlier_output_is_written_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,7 +165,8 @@ def test_bad_arguments_are_refused_before_anything_is_written(arguments: list[st
 
 
 def test_the_seeds_decide_the_outcome() -> None:
-    first, second = (evaluate_row(row_of("p1-c0.5", "pid"), seeds=2, generations=2).objectives for _ in range(2))
+    searches = searches_of(row_of("p1-c0.5", "pid"), seeds=2)
+    first, second = ([optimum(search, 2)["objective"] for search in searches] for _ in range(2))
     assert first == second
     assert first[0] != first[1]
 

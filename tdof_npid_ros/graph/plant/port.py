@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
-from tdof_npid_ros.graph.runtime.messages import lane_names
+from tdof_npid_ros.graph.runtime.messages import EPISODE, lane_names
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.parameters import NOISE
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
@@ -23,7 +23,6 @@ from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
 
-EPISODE = "episode"  # the topic
 Phase = Literal["waiting", "running", "stopped", "finished"]
 
 

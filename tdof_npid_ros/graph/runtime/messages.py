@@ -13,6 +13,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import SECOND
 
+EPISODE = "episode"  # the topic
 TASK = "state"  # of a node, in its diagnostics
 NAMED_LANES = 8  # more are read by programs, which go by the place
 
