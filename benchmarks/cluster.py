@@ -19,10 +19,10 @@ from tdof_npid_ros.workers import Workers, workers
 TITLE = "Dask workers beside threads"
 METHOD = (
     "The same chunks by `Workers.map`, which `reproduce`, `pareto` and robust sweeps go through, on two threads of "
-    "this process and on the two workers (processes of one thread each) of a Dask `LocalCluster` on this machine, in turn, "
-    "each warmed up; results are compared bit for bit. *Sweep*: the closed loop of Process 1 with 640 lanes, the gains "
-    "different in each, some half a second a chunk. *Seeds*: HGA runs of 2,000 evaluations on p3-c1, of which a good "
-    "part is Python. A ratio is the median of those of neighbours in time."
+    "this process and on the two workers (processes of one thread each) of a Dask `LocalCluster` on this machine, in "
+    "turn, each warmed up; results are compared bit for bit. *Sweep*: the closed loop of Process 1 with 640 lanes, the "
+    "gains different in each, some half a second a chunk. *Seeds*: HGA runs of 2,000 evaluations on p3-c1, of which a "
+    "good part is Python. A ratio is the median of those of neighbours in time."
 )
 PEERS = ("dask", "distributed")
 NOTES: tuple[str, ...] = ()

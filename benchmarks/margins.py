@@ -20,8 +20,8 @@ from tdof_npid_ros.tuning.study import Study
 
 TITLE = "Margins and certificate"
 METHOD = (
-    "`margins` and `certify` at the published gains of each linear row of the paper, the better of two, beside a "
-    "whole tuning run of the row (8,000 evaluations on all cores, once). A ratio is that of a row; the largest counts. "
+    "`margins` and `certify` at the published gains of each linear row of the paper, the better of two, beside a whole "
+    "tuning run of the row (8,000 evaluations on all cores, once). A ratio is that of a row; the largest counts. "
     "python-control gets the same sampled loop as its frequency response (`frd`) at 2,000 frequencies, which "
     "`stability_margins` interpolates: as a transfer function a dead time of hundreds of samples takes it minutes. "
     "Ours are exact, and tell the delay margin and the slowest mode, too."
@@ -43,9 +43,9 @@ def run(size: str) -> Result:
     for row in rows:
         case, gains, label = load_case(row.case), published_gains(row), f"{row.case} {row.controller}"
         tuning = _tuning_time(case, row, generations)
-        found, of_margins = _timed(lambda case=case, gains=gains: margins(case, gains))  # type: ignore[misc]
-        _, of_certificate = _timed(lambda case=case, gains=gains: certify(case, gains))  # type: ignore[misc]
-        theirs, of_peer = _timed(lambda case=case, gains=gains: _python_control(case, gains))  # type: ignore[misc]
+        found, of_margins = _timed(lambda case=case, gains=gains: margins(case, gains))
+        _, of_certificate = _timed(lambda case=case, gains=gains: certify(case, gains))
+        theirs, of_peer = _timed(lambda case=case, gains=gains: _python_control(case, gains))
         off = max(
             abs(theirs[name] / value - 1.0)
             for name, value in (("gm", found.gain_margin), ("pm", found.phase_margin_deg), ("ms", found.m_s))
