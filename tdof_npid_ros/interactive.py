@@ -13,24 +13,50 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.plotting import GUIDE, PALETTE, Panel, PlottingError, effort_range, shown_until
+from tdof_npid_ros.plotting import GUIDE, PALETTE, Panel, PlottingError, effort_notes, effort_range, shown_until
 
 MOST_POINTS = 20_000  # of a curve; longer ones are thinned to the least and the largest value of each stretch
 DASHES = ("solid", "dashed", "dashdot", "dotted", [10, 3], [3, 2], [8, 2, 2, 2])
 LEGEND_COLUMNS = 3  # narrow enough for a phone
 INK = "#808080"  # of axes and labels: readable on light and on dark
+DARK = """
+@media (prefers-color-scheme: dark) {
+  :host { --color: #e6e6e6; --background-color: #22262c; --surface-background-color: #22262c; --border-color: #565d66;
+    --divider-color: #3a4048; --hover-color: #2c323a; --default: #22262c; --default-border: #565d66;
+    --default-hover: #2c323a; --default-hover-border: #808080; --default-active: #3a4048;
+    --default-active-border: #808080; --default-disabled: #22262c; --icon-color: #a0a0a0; color-scheme: dark; }
+  .noUi-target { background: #22262c; border-color: #565d66; box-shadow: none; }
+  .noUi-handle { background: #a0a0a0; border-color: #565d66; box-shadow: none; }
+  .noUi-connect { background: #565d66; }
+  select.bk-input { background-image: none; appearance: auto; }
+  .bk-active.bk-btn-default { background-color: #0072b2; }
+}
+"""  # Bokeh's widgets and tools, which know light alone
+# A finger moves the page, not the plot, or nobody would come past a plot on a phone; two fingers zoom.
+BY_FINGER = """
+if (matchMedia("(pointer: coarse)").matches) {
+  for (const pan of pans) pan.active = false
+  for (const wheel of wheels) wheel.modifiers = {}
+}
+"""
 _NUMBER = re.compile(r"[-+]?(inf|nan|[\d.]+(e[-+]?\d+)?)|-?")
 
-CSS = """
+TABLES = """
+.table { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 14px; }
+th, td { padding: .25rem .7rem; text-align: left; border-bottom: 1px solid var(--grid); white-space: nowrap; }
+.number { text-align: right; }
+"""
+CSS = (
+    TABLES
+    + """
 :root { color-scheme: light dark; --ink: #1b1b1b; --paper: #fff; --faint: #666; --grid: #8883; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e6e6; --paper: #16181c; --faint: #a0a0a0; } }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); margin: 0 auto;
   max-width: 80rem; padding: 1rem; }
 h1 { font-size: 1.4rem; } h2 { font-size: 1.1rem; margin: 1.8rem 0 .3rem; }
-.table { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 14px; }
-th, td { padding: .25rem .7rem; text-align: left; border-bottom: 1px solid var(--grid); white-space: nowrap; }
-.number { text-align: right; } .note { color: var(--faint); font-size: 14px; max-width: 60rem; }
+.note { color: var(--faint); font-size: 14px; max-width: 60rem; }
 """
+)
 
 
 class Page:
@@ -58,19 +84,7 @@ class Page:
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:
         """A table, titles first; columns of numbers are aligned to the right; wide ones scroll."""
-        numeric = [all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*rows[1:], strict=True)]
-        if not numeric:
-            return
-
-        def line(cells: Sequence[str], tag: str) -> str:
-            classes = (' class="number"' if is_number else "" for is_number in numeric)
-            pairs = zip(cells, classes, strict=True)
-            return "<tr>" + "".join(f"<{tag}{class_}>{html.escape(cell)}</{tag}>" for cell, class_ in pairs) + "</tr>"
-
-        body = "".join(line(row, "td") for row in rows[1:])
-        self._parts.append(
-            f'<div class="table"><table><thead>{line(rows[0], "th")}</thead><tbody>{body}</tbody></table></div>'
-        )
+        self._parts.append(table_html(rows))
 
     def plot(self, *models: Any) -> None:
         """Plots, one below the other."""
@@ -83,9 +97,14 @@ class Page:
         body = "\n".join(self._parts)
         head = script = ""
         if self._models:
+            from bokeh.document import Document
             from bokeh.embed import components
             from bokeh.resources import Resources
 
+            document = Document()
+            for model in self._models:
+                document.add_root(model)
+            fit_to_screen(document)
             script, divisions = components(tuple(self._models))
             head = Resources(mode="inline", components=["bokeh"]).render_js()
             for number, division in enumerate(divisions):
@@ -110,19 +129,55 @@ class Page:
             raise PlottingError(f"{path} cannot be written: {error.strerror}") from None
 
 
-def new_plot(y_label: str, height: int = 300, **options: Any) -> Any:
-    """An empty Bokeh plot in the project's look: as wide as the page, readable on light and on dark ground."""
-    from bokeh.models import BoxZoomTool, HoverTool, PanTool, ResetTool, SaveTool, WheelZoomTool
+def table_html(rows: Sequence[Sequence[str]]) -> str:
+    """A table, titles first; columns of numbers are aligned to the right; wide ones scroll."""
+    numeric = [all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*rows[1:], strict=True)]
+    if not numeric:
+        return ""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        classes = (' class="number"' if is_number else "" for is_number in numeric)
+        pairs = zip(cells, classes, strict=True)
+        return "<tr>" + "".join(f"<{tag}{class_}>{html.escape(cell)}</{tag}>" for cell, class_ in pairs) + "</tr>"
+
+    body = "".join(line(row, "td") for row in rows[1:])
+    return f'<div class="table"><table><thead>{line(rows[0], "th")}</thead><tbody>{body}</tbody></table></div>'
+
+
+def fit_to_screen(document: Any) -> None:
+    """Make all that is in a Bokeh document readable on a dark ground, and leave swiping on a phone to the page."""
+    from bokeh.models import CustomJS, PanTool, WheelZoomTool
+
+    for root in document.roots:
+        fit_elements(root)
+    tools = {"pans": list(document.select({"type": PanTool})), "wheels": list(document.select({"type": WheelZoomTool}))}
+    document.js_on_event("document_ready", CustomJS(args=tools, code=BY_FINGER))
+
+
+def fit_elements(root: Any) -> None:
+    """Make what is in a Bokeh layout readable on a dark ground."""
+    from bokeh.models import UIElement
+
+    for element in root.select({"type": UIElement}):
+        if DARK not in element.stylesheets:
+            element.stylesheets = [*element.stylesheets, DARK]
+
+
+def new_plot(y_label: str, height: int = 300, *, x_label: str = "time (s)", **options: Any) -> Any:
+    """An empty Bokeh plot in the project's look: as wide as the page, readable on light and on dark ground.
+
+    The wheel alone moves the page on; with Ctrl it zooms.
+    """
+    from bokeh.models import BoxZoomTool, PanTool, ResetTool, SaveTool, WheelZoomTool
     from bokeh.plotting import figure
 
     plot = figure(
-        height=height, sizing_mode="stretch_width", toolbar_location="right", y_axis_label=y_label, tools="",
-        background_fill_color=None, border_fill_color=None, outline_line_color=None, min_width=260,
-        min_border_left=74, **options,
+        height=height, sizing_mode="stretch_width", toolbar_location="above", y_axis_label=y_label,
+        x_axis_label=x_label, tools="", background_fill_color=None, border_fill_color=None, outline_line_color=None,
+        min_width=260, min_border_left=74, **options,
     )  # fmt: skip
-    wheel = WheelZoomTool(dimensions="width")
+    wheel = WheelZoomTool(dimensions="width", modifiers="ctrl")
     plot.add_tools(PanTool(), BoxZoomTool(), wheel, ResetTool(), SaveTool())
-    plot.add_tools(HoverTool(tooltips=[("", "$name"), ("t", "@x{0.[0000]} s"), ("", "@y{0.[000000]}")], mode="mouse"))
     plot.toolbar.logo = None
     plot.toolbar.active_scroll = wheel
     for axis in (*plot.xaxis, *plot.yaxis):
@@ -132,6 +187,27 @@ def new_plot(y_label: str, height: int = 300, **options: Any) -> Any:
     for grid in (*plot.xgrid, *plot.ygrid):
         grid.grid_line_color, grid.grid_line_alpha = INK, 0.25
     return plot
+
+
+def draw(
+    plot: Any, source: Any, column: str, *, color: str, dash: Any = "solid", width: float = 2.0, unit: str = ""
+) -> Any:
+    """Draw a column of a source over its column `time`; its name is in the legend, and hovering tells its values.
+
+    Returns:
+        Bokeh's renderer.
+    """
+    from bokeh.models import HoverTool
+
+    curve = plot.line(
+        "time", column, source=source, legend_label=column, name=column, color=color, line_dash=dash, line_width=width
+    )
+    told = (
+        f'<span style="color: {color}">&#9632;</span> {html.escape(column)}: '
+        f"<b>@$name{{0.[000000]}}</b> {html.escape(unit)}<br>at @time{{0.[0000]}} s"
+    )
+    plot.add_tools(HoverTool(renderers=[curve], tooltips=told, mode="mouse", visible=False))
+    return curve
 
 
 def finish_legend(plot: Any) -> None:
@@ -150,28 +226,37 @@ def finish_legend(plot: Any) -> None:
 
 def response_plots(panel: Panel, *, unit: str = "", effort_unit: str = "") -> list[Any]:
     """The output and the effort of an episode, two plots that zoom together; limits drawn, saturation shaded."""
-    from bokeh.models import BoxAnnotation, Range1d, Span
+    from bokeh.models import BoxAnnotation, Range1d, Span, Title
 
     until = shown_until(panel)
-    output = new_plot("output" + (f" ({unit})" if unit else ""), 300)
-    effort = new_plot("effort" + (f" ({effort_unit})" if effort_unit else ""), 220, x_range=output.x_range)
+    output = new_plot("output" + (f" ({unit})" if unit else ""), 300, x_label="")
+    effort = new_plot("effort" + (f" ({effort_unit})" if effort_unit else ""), 240, x_range=output.x_range)
     output.x_range.start, output.x_range.end = panel.begin, until
-    effort.xaxis.axis_label = "time (s)"
     drawn: set[bytes] = set()
+    look: dict[str, Any]
     for number, curve in enumerate(panel.curves):
-        given = ((output, curve.setpoint, "setpoint", "dashed"), (effort, curve.disturbance, "disturbance", "dotted"))
-        for plot, values, name, dash in given:
-            if values is None or not np.nan_to_num(values).any() or (key := name.encode() + values.tobytes()) in drawn:
+        given = (
+            (output, curve.setpoint, "setpoint", "dashed", unit),
+            (effort, curve.disturbance, "disturbance", "dotted", effort_unit),
+        )
+        for plot, values, name, dash, its_unit in given:
+            if values is None or (key := name.encode() + values.tobytes()) in drawn or not _is_drawn(values, name):
                 continue
             drawn.add(key)
-            line(plot, curve.time, values, name, color=GUIDE, dash=dash, width=1.4, steps=True)
-        look: dict[str, Any] = {"color": PALETTE[number % len(PALETTE)], "dash": DASHES[number % len(DASHES)]}
-        above = line(output, curve.time, curve.output, curve.label, width=2.2, **look)
-        below = line(effort, curve.time, curve.effort, curve.label, width=1.8, steps=True, **look)
+            look = {"color": GUIDE, "dash": dash, "width": 1.4, "unit": its_unit}
+            draw(plot, source_of(curve.time, values, name, steps=True), name, **look)
+        name = curve.label
+        look = {"color": PALETTE[number % len(PALETTE)], "dash": DASHES[number % len(DASHES)]}
+        above = draw(output, source_of(curve.time, curve.output, name), name, unit=unit, width=2.2, **look)
+        its_effort = source_of(curve.time, curve.effort, name, steps=True)
+        below = draw(effort, its_effort, name, unit=effort_unit, width=1.8, **look)
         above.js_link("visible", below, "visible")
         for first, last in _at_limit(panel, curve.time, curve.effort):
             shade = {"fill_color": GUIDE, "fill_alpha": 0.15, "line_color": None}
             effort.add_layout(BoxAnnotation(left=first, right=last, **shade))
+    if notes := effort_notes(panel, until):
+        told = Title(text="; ".join(notes), text_color=INK, text_font_size="12px", text_font_style="normal")
+        effort.add_layout(told, "above")
     low, high, _ = effort_range(panel, until)
     effort.y_range = Range1d(low, high)
     for limit in panel.limits:
@@ -185,20 +270,29 @@ def response_plots(panel: Panel, *, unit: str = "", effort_unit: str = "") -> li
     return [output, effort]
 
 
-def line(
-    plot: Any, time: np.ndarray, values: np.ndarray, label: str, *, color: str, dash: Any = "solid", width: float = 2.0,
-    steps: bool = False,
-) -> Any:  # fmt: skip
-    """A curve with its legend and what hovering tells of it; returns Bokeh's renderer."""
+def _is_drawn(given: np.ndarray, name: str) -> bool:
+    """Whether a setpoint or disturbance is worth a curve: one that never changes is told of a disturbance."""
+    return bool(np.isfinite(given).any()) and (name == "setpoint" or bool(np.ptp(given[np.isfinite(given)])))
+
+
+def source_of(time: np.ndarray, values: np.ndarray, name: str, *, steps: bool = False) -> Any:
+    """A curve (samples,) as what a Bokeh plot draws: columns `time` and its name; of one in steps, their corners."""
     from bokeh.models import ColumnDataSource
 
-    x, y = thinned(time, values)
+    time, values = thinned(time, values)
     if steps:
-        x, y = np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
-    source = ColumnDataSource({"x": x, "y": y}, name=label)
-    return plot.line(
-        "x", "y", source=source, legend_label=label, name=label, color=color, line_dash=dash, line_width=width
-    )
+        time, values = corners(time, values)
+    return ColumnDataSource({"time": time, name: values}, name=name)
+
+
+def corners(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve that holds each value until the next one comes, by its corners.
+
+    Example:
+        >>> corners(np.array([0.0, 1.0]), np.array([5.0, 6.0]))
+        (array([0., 1., 1.]), array([5., 5., 6.]))
+    """
+    return np.repeat(time, 2)[1:], np.repeat(values, 2)[:-1]
 
 
 def thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -216,30 +216,43 @@ def draw_responses(
 
 
 def _draw_panel(panel: Panel, above: Axes, below: Axes, until: float) -> None:
-    notes = _draw_given(panel, above, below)
+    _draw_given(panel, above, below)
     for number, curve in enumerate(panel.curves):
         look = {**style(number), "label": curve.label, "zorder": 3 + number}
         above.plot(curve.time, curve.output, **look)
         below.plot(curve.time, curve.effort, drawstyle="steps-post", **look)
-    low, high, cut = effort_range(panel, until)
+    low, high, _ = effort_range(panel, until)
     for limit in panel.limits:
         if np.isfinite(limit) and low - 0.5 * (high - low) <= limit <= high + 0.5 * (high - low):
             below.axhline(limit, label="effort's limits", color=GUIDE, linewidth=1.0, zorder=1)
             low, high = min(low, limit - 0.04 * (high - low)), max(high, limit + 0.04 * (high - low))
     _shade_saturation(panel, below)
     below.set_ylim(low, high)
-    if cut:
-        most = max(float(np.nanmax(np.abs(c.effort[c.time <= until]), initial=0.0)) for c in panel.curves)
-        notes.append(f"kick to {most:.3g}, cut off")
     below.annotate(
-        "\n".join(notes), (0.99, 0.96), xycoords="axes fraction", ha="right", va="top", fontsize=8, color="#555555"
+        "\n".join(effort_notes(panel, until)),
+        (0.99, 0.96),
+        xycoords="axes fraction",
+        ha="right",
+        va="top",
+        fontsize=8,
+        color="#555555",
     )
 
 
-def _draw_given(panel: Panel, above: Axes, below: Axes) -> list[str]:
+def effort_notes(panel: Panel, until: float) -> list[str]:
+    """What a plot of the efforts does not show: a disturbance that never changes, and what of a kick was cut off."""
+    known = (c.disturbance[np.isfinite(c.disturbance)] for c in panel.curves if c.disturbance is not None)
+    constant = {float(d[0]) for d in known if np.any(d) and not np.ptp(d)}
+    notes = [f"disturbance {d:g} throughout" for d in sorted(constant)]
+    if effort_range(panel, until)[2]:
+        most = max(float(np.nanmax(np.abs(c.effort[c.time <= until]), initial=0.0)) for c in panel.curves)
+        notes.append(f"kick to {most:.3g}, cut off")
+    return notes
+
+
+def _draw_given(panel: Panel, above: Axes, below: Axes) -> None:
     """Setpoints and disturbances, each once; a disturbance that never changes is told, not drawn."""
     guide: dict[str, Any] = {"color": GUIDE, "linewidth": 1.1, "drawstyle": "steps-post", "zorder": 1}
-    notes: list[str] = []
     drawn: set[bytes] = set()
     for curve in panel.curves:
         r, d = curve.setpoint, curve.disturbance
@@ -251,9 +264,6 @@ def _draw_given(panel: Panel, above: Axes, below: Axes) -> list[str]:
         drawn.add(content)
         if np.ptp(d):
             below.plot(curve.time, d, label="disturbance d", linestyle=(0, (1, 2)), **guide)
-        else:
-            notes.append(f"disturbance {d[0]:g} throughout")
-    return notes
 
 
 def _shade_saturation(panel: Panel, axis: Axes) -> None:

@@ -16,13 +16,13 @@ import numpy as np
 from tdof_npid_ros.advice import gravest
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
-from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
+from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.interactive import Page, response_plots
-from tdof_npid_ros.loop import Trajectory
 from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
-from tdof_npid_ros.plotting import Curve, Panel, draw_responses
+from tdof_npid_ros.plotting import Panel, draw_responses
+from tdof_npid_ros.prediction import gains_table, numbers, panels, shown, simulated
 from tdof_npid_ros.stability.margins import margins
 
 
@@ -71,12 +71,12 @@ def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Nam
     """
     if not outputs_of(arguments):
         return
-    runs = {name: {label: case.simulate(name, gains) for label, gains in of.items()} for name in case.plans}
-    panels = [_panel(case, name, curves) for name, curves in runs.items()]
+    runs = simulated(case, of)
+    drawn = panels(case, runs)
     if arguments.plot:
-        draw_responses(panels, arguments.plot, title=case.name)
+        draw_responses(drawn, arguments.plot, title=case.name)
     if arguments.html:
-        _page(case, of, panels).write(arguments.html)
+        _page(case, of, drawn).write(arguments.html)
     if arguments.csv:
         with arguments.csv.open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
@@ -87,38 +87,15 @@ def write_responses(case: Case, of: Mapping[str, Gains], arguments: argparse.Nam
                     table.writerows((name, label, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
 
 
-def _page(case: Case, of: Mapping[str, Gains], panels: Sequence[Panel]) -> Page:
+def _page(case: Case, of: Mapping[str, Gains], drawn: Sequence[Panel]) -> Page:
     page = Page(case.name)
-    reports = {label: response_report(case, gains) for label, gains in of.items()}
-    metrics = [
-        (episode, name) for episode in ("setpoint", "disturbance") for name in next(iter(reports.values()))[episode]
-    ]
-    metrics = [pair for pair in metrics if pair[1] != "reason"]
-    page.table(
-        [
-            ["", *(f"{episode}: {name.replace('_', ' ')}" for episode, name in metrics)],
-            *(
-                [label, *("-" if (v := report[e][n]) is None else _shown(n, v) for e, n in metrics)]
-                for label, report in reports.items()
-            ),
-        ]
-    )
-    for panel in panels:
+    page.table(numbers(case, of))
+    for panel in drawn:
         page.heading(panel.title)
         page.plot(*response_plots(panel))
     page.heading("Gains")
-    page.table([["", *PER_LANE], *([label, *(f"{getattr(g, n):g}" for n in PER_LANE)] for label, g in of.items())])
+    page.table(gains_table(of))
     return page
-
-
-def _panel(case: Case, name: str, runs: Mapping[str, Trajectory]) -> Panel:
-    curves = [
-        Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance)
-        for label, run in runs.items()
-    ]
-    low, high = (float(case.gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
-    limits = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
-    return Panel(name, curves, limits)
 
 
 def response_report(case: Case, gains: Gains) -> dict[str, Any]:
@@ -149,11 +126,6 @@ def _table(report: dict[str, Any]) -> list[str]:
     lines = []
     for episode in ("setpoint", "disturbance"):
         for name, value in report[episode].items():
-            shown = value if isinstance(value, str) else "-" if value is None else _shown(name, value)
-            lines.append(f"  {episode:12} {name:18} {shown}")
+            told = value if isinstance(value, str) else "-" if value is None else shown(name, value)
+            lines.append(f"  {episode:12} {name:18} {told}")
     return [*lines, f"  objective {in_units(report['objective'])}"]
-
-
-def _shown(name: str, value: float) -> str:
-    """A metric for people; a share needs no digits below the table's."""
-    return f"{value:.4f}" if name.endswith("_percent") and abs(value) < 1e6 else in_units(value)

@@ -91,10 +91,9 @@ def add_constraint_arguments(parser: argparse.ArgumentParser) -> None:
 
 def constraints_of(arguments: argparse.Namespace, case: Case | None = None) -> Constraints:
     """What `add_constraint_arguments` were given, or else the case's file gives the tuner."""
-    of_case = case.search if case else {}
-    names = [field.name for field in fields(Constraints)]
-    asked = {name: getattr(arguments, name) for name in names}
-    return Constraints(**{name: of_case.get(name) or None if asked[name] is None else asked[name] for name in names})
+    asked = {field.name: getattr(arguments, field.name) for field in fields(Constraints)}
+    of_case = Constraints.of_search(case.search if case else {})
+    return replace(of_case, **{name: value for name, value in asked.items() if value is not None})
 
 
 def run(arguments: argparse.Namespace) -> int:

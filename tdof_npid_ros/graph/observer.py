@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import rclpy
@@ -34,6 +34,7 @@ KEPT = 20_000  # rows that are kept for those who look on
 LOOKING_ON = QoSProfile(depth=2000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 TOLD = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 NODES = ("plant", "controller", "scenario", "tuner", "recorder")
+T = TypeVar("T")
 WITHOUT_ANSWER = 1.0  # s after which a loop counts as standing still
 
 
@@ -57,6 +58,18 @@ class Row(NamedTuple):
     stamp_ns: int
 
 
+class Terms(NamedTuple):
+    """What an answer is made of.
+
+    Attributes:
+        time: s, as in `Row`.
+        values: (terms, lanes), in the order of `control.law.TERMS`.
+    """
+
+    time: float
+    values: np.ndarray
+
+
 @dataclass
 class NodeState:
     """What a node's diagnostics say."""
@@ -75,6 +88,8 @@ class LoopObserver:
 
     Attributes:
         rows: the latest answers, oldest first; `count` of them have come in all.
+        terms: what they are made of; `term_count` have come in all.
+        lane_names: of the loop's lanes, as its output names them, or their numbers; empty before it has been heard.
         nodes: what the nodes' diagnostics say, by the node's name without its namespace.
     """
 
@@ -87,8 +102,9 @@ class LoopObserver:
         )
         self._lock = threading.Lock()
         self.rows: deque[Row] = deque(maxlen=KEPT)
-        self.terms: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
-        self.count = 0
+        self.terms: deque[Terms] = deque(maxlen=KEPT)
+        self.count = self.term_count = 0
+        self.lane_names: tuple[str, ...] = ()
         self.nodes: dict[str, NodeState] = {}
         self._outputs: dict[int, Sample] = {}
         self._labels: dict[str, int] = {}
@@ -152,7 +168,8 @@ class LoopObserver:
                 elif topic == "control_effort":
                     self._take_answer(sample)
                 elif len(sample.position) % len(TERMS) == 0:
-                    self.terms.append((self._time_of(sample), sample.position.reshape(len(TERMS), -1)))
+                    self.terms.append(Terms(self._time_of(sample), sample.position.reshape(len(TERMS), -1)))
+                    self.term_count += 1
 
     def _take_answer(self, answer: Sample) -> None:
         output = self._outputs.pop(answer.stamp_ns, None)
@@ -163,6 +180,10 @@ class LoopObserver:
             self._base = self._last
             self._labels[self._label] = len(self._labels)
         self._last = self._time_of(answer)
+        if len(answer.name) == len(answer.effort):
+            self.lane_names = answer.name
+        elif len(self.lane_names) != len(answer.effort):
+            self.lane_names = tuple(map(str, range(len(answer.effort))))
         self._latest_answer = time.monotonic()
         y, applied = output.position, output.effort
         if len(y) != len(answer.effort):
@@ -182,8 +203,12 @@ class LoopObserver:
     def rows_since(self, count: int) -> tuple[list[Row], int]:
         """The answers after the first `count` ones, as far as they are kept, and how many there have been in all."""
         with self._lock:
-            new = min(self.count - count, len(self.rows))
-            return [self.rows[i] for i in range(len(self.rows) - new, len(self.rows))] if new > 0 else [], self.count
+            return _latest(self.rows, self.count - count), self.count
+
+    def terms_since(self, count: int) -> tuple[list[Terms], int]:
+        """What the answers are made of, likewise."""
+        with self._lock:
+            return _latest(self.terms, self.term_count - count), self.term_count
 
     @property
     def runs(self) -> bool:
@@ -220,3 +245,9 @@ class LoopObserver:
     def flush(self, topic: str) -> None:
         """Wait until what was published has been received."""
         self._publishers[topic].wait_for_all_acked(Duration(seconds=2.0))
+
+
+def _latest(kept: deque[T], number: int) -> list[T]:
+    """So many of the last ones, as far as they are kept."""
+    number = min(number, len(kept))
+    return [kept[i] for i in range(-number, 0)]

@@ -4,364 +4,159 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from bokeh.document import Document
 from bokeh.layouts import column, row
-from bokeh.models import (
-    Button,
-    ColumnDataSource,
-    CustomJSTickFormatter,
-    Div,
-    NumericInput,
-    Select,
-    Slider,
-    Span,
-    Toggle,
-)
+from bokeh.models import Checkbox, Div, Select
 
-from tdof_npid_ros.case import Case
-from tdof_npid_ros.control.gains import PER_LANE, TUNED
-from tdof_npid_ros.graph.observer import LoopObserver, Row
-from tdof_npid_ros.interactive import CSS, finish_legend, new_plot
-from tdof_npid_ros.live.steering import Steering
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE
+from tdof_npid_ros.interactive import CSS, TABLES, fit_to_screen
+from tdof_npid_ros.live.gain_controls import GainControls
+from tdof_npid_ros.live.hand import Hand
+from tdof_npid_ros.live.plots import ROLLOVER, LivePlots, at_lane
 from tdof_npid_ros.live.step import Steps
-from tdof_npid_ros.parameters import CONTROLLER_TYPES
-from tdof_npid_ros.plotting import GUIDE, PALETTE
+from tdof_npid_ros.live.tune_controls import TuneControls
+from tdof_npid_ros.live.view import LiveLoop, View, of_lane
 
 REFRESH_MS = 50  # plots
 LOOK_MS = 500  # numbers, widgets and diagnostics
 WINDOW = 20.0  # s that scroll by, at first, of a loop of which no case is known
-ROLLOVER = 4000  # points of a curve that a browser holds
-MOST_AT_ONCE = 400  # points that one refresh sends; a faster loop is thinned
-DECADES = 2.0  # of a slider to either side of a gain that has no bounds
-LINEAR = ("alpha", "beta")  # gains whose sliders are linear, from 0 to 1
-SMALL_CSS = """
-.loop { display: grid; grid-template-columns: minmax(0, 1fr) 22rem; gap: 1rem; }
-@media (max-width: 800px) { .loop { grid-template-columns: minmax(0, 1fr); } }
-.bk-input { font-size: 15px; } .refused { color: #d55e00; font-size: 14px; }
+LOOP_CSS = """
+.loop { display: grid; grid-template-columns: minmax(0, 1fr) 22rem; grid-template-rows: min-content 1fr; gap: 0 1rem; }
+.controls { grid-column: 2; grid-row: 1 / 3; } .proposal, .plots { grid-column: 1; }
+@media (max-width: 800px) { .loop { display: flex; flex-direction: column; } .plots { order: -1; } }
 """
+REFUSED_CSS = ".refused, :host(.refused) { color: #d55e00; font-size: 14px; }"
 TEMPLATE = (
-    "{% block title %}Live loop{% endblock %}{% block postamble %}<style>"
+    '{% block preamble %}<meta name="viewport" '
+    'content="width=device-width, initial-scale=1">{% endblock %}{% block postamble %}<style>'
     + CSS
-    + SMALL_CSS
-    + "</style>{% endblock %}{% block contents %}<h1>Live loop</h1>{{ embed(roots.numbers) }}"
-    '<div class="loop"><div>{{ embed(roots.plots) }}</div><div>{{ embed(roots.controls) }}</div></div>'
-    "{{ embed(roots.nodes) }}{% endblock %}"
+    + LOOP_CSS
+    + "</style>{% endblock %}{% block contents %}<h1>{{ title | e }}</h1>"
+    "{{ embed(roots.choice) }}{{ embed(roots.numbers) }}"
+    '<div class="loop"><div class="controls">{{ embed(roots.controls) }}</div>'
+    '<div class="proposal">{{ embed(roots.proposal) }}</div><div class="plots">{{ embed(roots.plots) }}'
+    "{{ embed(roots.nodes) }}</div></div>{% endblock %}"
 )
-Handler = Callable[[str, Any, Any], None]
 DOWN = "the loop stands still: no answers come"
 
 
 class LivePage:
-    """What one browser shows; all of them share the observer and the steering.
+    """What one browser shows; all of them share the loops.
 
     Args:
         document: of this browser.
-        observer, steering: of the loop.
-        case: its parameter file, where the user named one: for the ranges of the sliders.
+        loops: to choose from; the first one is shown.
         keep_in: folder that kept gains are written to.
-        record: begins or ends a recording, and says where it goes; None: there is none.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        observer: LoopObserver,
-        steering: Steering,
-        case: Case | None,
-        keep_in: Path,
-        record: Callable[[bool], str] | None = None,
-    ) -> None:
-        self._document, self._observer, self._steering, self._case = document, observer, steering, case
-        self._keep_in, self._record = keep_in, record
-        self._lane = 0
-        self._seen = observer.count
-        self._steps = Steps()
-        self._shown: dict[str, Any] = {}
-        self._period = 0.01
-        self._make_plots()
-        self._make_controls()
+    def __init__(self, document: Document, loops: Sequence[LiveLoop], keep_in: Path) -> None:
+        self._loops = {loop.namespace: loop for loop in loops}
+        self._view = view = View(loops[0])
+        case = view.loop.case
+        self._plots = LivePlots(self._window(), 1.0 if case is None else case.largest_step or 1.0)
+        self._gains = GainControls(view, keep_in)
+        self._hand = Hand(view, self._gains.told)
+        self._tune = TuneControls(view)
+        names = list(self._loops)
+        self._which_loop = Select(title="loop", options=names, value=names[0], name="loop", visible=len(names) > 1)
+        self._which_lane = Select(title="lane", options=["0"], value="0", name="lane", visible=False)
+        self._alone = Checkbox(label="gains of this lane alone", name="alone", visible=False)
+        self._which_loop.on_change("value", lambda _, __, new: self._choose(self._loops[new], 0))
+        self._which_lane.on_change("value", lambda _, __, new: self._choose(view.loop, int(new)))
+        self._alone.on_change("active", lambda _, __, new: setattr(view, "alone", new))
         self._numbers = Div(text="", name="numbers", sizing_mode="stretch_width")
         self._nodes = Div(text="", name="nodes", sizing_mode="stretch_width")
+        controls = (self._gains.layout, self._hand.layout, self._tune.layout)
+        for part in controls:
+            part.sizing_mode = "stretch_width"
         document.template = TEMPLATE
-        document.title = "Live loop"
-        for root in (self._plots, self._controls, self._numbers, self._nodes):
+        document.title = "Live loop" + (f": {case.name}" if case is not None else "")
+        for root in (
+            row(self._which_loop, self._which_lane, self._alone, name="choice"),
+            self._numbers,
+            self._tune.look_layout,
+            self._plots.layout,
+            column(*controls, name="controls", sizing_mode="stretch_width"),
+            self._nodes,
+        ):
+            for div in root.select({"type": Div}):
+                div.stylesheets = [*div.stylesheets, TABLES, REFUSED_CSS]
             document.add_root(root)
+        fit_to_screen(document)
+        self._begin()
         document.add_periodic_callback(self.refresh, REFRESH_MS)
         document.add_periodic_callback(self.look, LOOK_MS)
+        self.refresh()
         self.look()
 
-    # Plots
+    def _begin(self) -> None:
+        """Show what has been heard of the loop lately, and go on from there."""
+        observer = self._view.loop.observer
+        self._seen, self._seen_terms = observer.count - ROLLOVER, observer.term_count - ROLLOVER
+        self._steps, self._period = Steps(), 0.01
+        self._plots.clear()
 
-    def _make_plots(self) -> None:
-        self._signals = ColumnDataSource({name: [] for name in ("t", "r", "y", "u", "applied")})
-        self._terms = ColumnDataSource({name: [] for name in ("t", "p", "i", "d")})
-        self._latest_step = ColumnDataSource({"t": [], "y": []})
-        self._previous_step = ColumnDataSource({"t": [], "y": []})
-        output = new_plot("output", 260)
-        effort = new_plot("effort", 190, x_range=output.x_range)
-        terms = new_plot("P, I, D", 170, x_range=output.x_range)
-        step = new_plot("latest step", 220)
-        output.line(
-            "t", "r", source=self._signals, legend_label="setpoint", name="setpoint", color=GUIDE, line_dash="dashed"
-        )
-        output.line(
-            "t", "y", source=self._signals, legend_label="output", name="output", color=PALETTE[0], line_width=2
-        )
-        effort.step(
-            "t",
-            "u",
-            source=self._signals,
-            legend_label="effort",
-            name="effort",
-            color=PALETTE[1],
-            line_width=2,
-            mode="after",
-        )
-        effort.step(
-            "t",
-            "applied",
-            source=self._signals,
-            legend_label="applied",
-            name="applied",
-            color=PALETTE[2],
-            line_dash="dotted",
-            mode="after",
-        )
-        for name, colour in zip("pid", PALETTE, strict=False):
-            terms.line("t", name, source=self._terms, legend_label=name.upper(), name=name.upper(), color=colour)
-        step.line(
-            "t",
-            "y",
-            source=self._previous_step,
-            legend_label="the one before",
-            name="the one before",
-            color=GUIDE,
-            line_dash="dashed",
-        )
-        step.line(
-            "t",
-            "y",
-            source=self._latest_step,
-            legend_label="latest step",
-            name="latest step",
-            color=PALETTE[0],
-            line_width=2,
-        )
-        step.xaxis.axis_label = "time since the step (s)"
-        self._limits = [Span(location=math.nan, dimension="width", line_color=GUIDE, line_width=1) for _ in range(2)]
-        for span in self._limits:
-            effort.add_layout(span)
-        for plot in (output, effort, terms, step):
-            finish_legend(plot)
-        for plot in (effort, terms):
-            plot.toolbar_location = None
-        output.x_range.follow, output.x_range.follow_interval, output.x_range.range_padding = "end", self._window(), 0.0
-        self._plots = column(output, effort, terms, step, name="plots", sizing_mode="stretch_width")
-
-    # Controls
-
-    def _make_controls(self) -> None:
-        steering = self._steering
-        self._sliders: dict[str, Slider] = {}
-        self._fields: dict[str, NumericInput] = {}
-        self._reasons = {
-            name: Div(text="", css_classes=["refused"], visible=False) for name in (*PER_LANE, "type", "other")
-        }
-        rows: list[Any] = []
-        self._type = Select(title="controller", options=list(CONTROLLER_TYPES), value="tdof_npid2", name="type")
-        self._type.on_change("value", lambda _, __, new: self._ask({"type": new}))
-        rows += [self._type, self._reasons["type"]]
-        for name in PER_LANE:
-            slider = self._slider(name)
-            given = NumericInput(value=None, mode="float", width=110, name=f"{name}_field")
-            slider.on_change(
-                "value_throttled", lambda _, __, new, name=name: self._ask({name: self._of_slider(name, new)})
-            )
-            given.on_change("value", self._asking(name))
-            self._sliders[name], self._fields[name] = slider, given
-            rows += [row(slider, given, sizing_mode="stretch_width"), self._reasons[name]]
-        undo, redo = Button(label="undo", name="undo"), Button(label="redo", name="redo")
-        keep, self._kept = Button(label="keep", name="keep"), Div(text="", name="kept")
-        undo.on_click(steering.undo)
-        redo.on_click(steering.redo)
-        keep.on_click(self._keep)
-        rows += [row(undo, redo, keep), self._kept]
-        begins = 0.0 if self._case is None else self._case.plant.initial_output
-        size = 1.0 if self._case is None else self._case.largest_step or 1.0
-        self._setpoint = NumericInput(title="setpoint", value=begins, mode="float", width=110, name="setpoint_field")
-        self._size = NumericInput(title="step by", value=size, mode="float", width=110, name="size")
-        up, down = Button(label="step up", name="step_up"), Button(label="step down", name="step_down")
-        self._setpoint.on_change("value", _given(steering.setpoint))
-        up.on_click(lambda: self._step(1.0))
-        down.on_click(lambda: self._step(-1.0))
-        rows += [row(self._setpoint, self._size), row(up, down)]
-        disturbance = NumericInput(title="disturbance", value=0.0, mode="float", width=110, name="disturbance_field")
-        disturbance.on_change("value", _given(steering.disturbance))
-        self._manual = Toggle(label="by hand", name="manual")
-        self._manual.on_change("active", self._on_manual)
-        self._by_hand = NumericInput(title="effort by hand", value=0.0, mode="float", width=110, name="by_hand")
-        self._by_hand.on_change("value", self._asking("manual_effort"))
-        reset = Button(label="reset the plant", name="reset")
-        reset.on_click(steering.reset)
-        rows += [row(disturbance, self._by_hand), row(self._manual, reset), self._reasons["other"]]
-        if self._record is not None:
-            self._recording = Toggle(label="record", name="record")
-            self._recorded = Div(text="", name="recorded")
-            self._recording.on_change("active", self._on_record)
-            rows += [self._recording, self._recorded]
-        self._controls = column(*rows, name="controls", sizing_mode="stretch_width")
-
-    def _slider(self, name: str) -> Slider:
-        if name in LINEAR:
-            look: dict[str, Any] = {"title": name, "name": name, "format": "0.000", "sizing_mode": "stretch_width"}
-            return Slider(start=0.0, end=1.0, step=0.001, value=0.0, **look)
-        shown = CustomJSTickFormatter(code="return (10 ** tick).toPrecision(4)")
-        return Slider(
-            start=-3.0, end=3.0, step=0.001, value=0.0, title=name, format=shown, name=name, sizing_mode="stretch_width"
-        )
-
-    def _fit_slider(self, name: str, value: float) -> None:
-        """A slider's ends: the tuner's bounds, or some decades around the value; its value."""
-        slider, bounds = self._sliders[name], self._case.bounds.get(name) if self._case else None
-        if name in LINEAR:
-            slider.update(start=min(0.0, value), end=max(1.0, value), value=value)
+    def _choose(self, loop: LiveLoop, lane: int) -> None:
+        if (loop, lane) == (self._view.loop, self._view.lane):
             return
-        size = abs(value)
-        if bounds is not None and max(map(abs, bounds)) > 0:
-            most = max(map(abs, bounds))
-            least = min(map(abs, bounds)) or most * 1e-4
-        else:
-            most, least = (size or 1.0) * 10**DECADES, (size or 1.0) * 10**-DECADES
-        least, most = min(least, size or least), max(most, size)
-        at = math.log10(size) if size else math.log10(least)
-        slider.update(start=math.log10(least), end=math.log10(most), value=at)
-
-    def _of_slider(self, name: str, at: float) -> float:
-        if name in LINEAR:
-            return round(at, 6)
-        sign = -1.0 if any((self._scalar(gain) or 0.0) < 0 for gain in ("kp", "ki", "kd")) and name != "sigma" else 1.0
-        return float(f"{sign * 10**at:.4g}")
-
-    def _scalar(self, name: str) -> float | None:
-        value = self._steering.values.get(name)
-        if isinstance(value, (list, tuple)):
-            value = value[min(self._lane, len(value) - 1)]
-        return None if value is None else float(value)
-
-    def _asking(self, name: str) -> Handler:
-        return _given(lambda value: self._ask({name: value}))
-
-    def _ask(self, values: dict[str, Any]) -> None:
-        """Ask for a change by hand; what the loop has already is none."""
-        now = self._steering.values
-        if now and any(now.get(name) != value for name, value in values.items()):
-            self._steering.change(values)
-
-    def _on_manual(self, _: str, __: bool, active: bool) -> None:
-        rows, _count = self._observer.rows_since(self._observer.count - 1)
-        values: dict[str, Any] = {"manual": active}
-        if active and rows:
-            values["manual_effort"] = float(rows[-1].effort[self._lane])  # from where the effort is
-        self._ask(values)
+        self._view.loop, self._view.lane = loop, lane
+        self._which_lane.value = str(lane)
+        self._begin()
+        self._gains.forget()
+        self._hand.forget()
+        self.refresh()
+        self.look()
 
     def _window(self) -> float:
         """How many seconds scroll by: an episode, or as much of it as a browser holds."""
-        if self._case is None or not self._case.plans:
+        case = self._view.loop.case
+        if case is None or not case.plans:
             return WINDOW
-        shortest = min(plan.end_ns for plan in self._case.plans.values()) / 1e9
-        return min(shortest, ROLLOVER * self._case.sample_period)
-
-    def _step(self, sign: float) -> None:
-        rows, _ = self._observer.rows_since(self._observer.count - 1)
-        now = float(rows[-1].setpoint[self._lane]) if rows else float(self._setpoint.value or 0.0)
-        self._setpoint.value = now + sign * float(self._size.value or 0.0)
-
-    def _keep(self) -> None:
-        path = _free(self._keep_in, "gains", ".yaml")
-        try:
-            self._steering.keep(path)
-        except ValueError as error:
-            self._kept.text = f'<span class="refused">{html.escape(str(error))}</span>'
-        else:
-            self._kept.text = f"written: {html.escape(str(path))}"
-
-    def _on_record(self, _: str, __: bool, active: bool) -> None:
-        assert self._record is not None
-        try:
-            self._recorded.text = html.escape(self._record(active))
-        except (ValueError, OSError, RuntimeError) as error:
-            self._recorded.text = f'<span class="refused">{html.escape(str(error))}</span>'
+        shortest = min(plan.end_ns for plan in case.plans.values()) / 1e9
+        return min(shortest, ROLLOVER * case.sample_period)
 
     # Now and then
 
     def refresh(self) -> None:
         """Send what has come since."""
-        rows, self._seen = self._observer.rows_since(self._seen)
+        observer, lane = self._view.loop.observer, self._view.lane
+        rows, self._seen = observer.rows_since(self._seen)
+        terms, self._seen_terms = observer.terms_since(self._seen_terms)
+        if terms:
+            self._plots.add_terms(terms, lane)
         if not rows:
             return
-        lane = min(self._lane, len(rows[-1].output) - 1)
         for one in rows:
-            self._steps.take(one.time, one.episode, _at(one.setpoint, lane), _at(one.output, lane))
+            self._steps.take(one.time, one.episode, at_lane(one.setpoint, lane), at_lane(one.output, lane))
         if len(rows) > 1:
             self._period = max((rows[-1].time - rows[0].time) / (len(rows) - 1), 1e-9)
-        self._signals.stream(_columns(_some(rows), lane), rollover=ROLLOVER)
+        self._plots.add(rows, lane)
 
     def look(self) -> None:
         """Bring numbers, widgets and diagnostics up to date."""
-        self._show_values()
-        self._show_step()
+        view, names = self._view, self._view.loop.observer.lane_names
+        self._which_lane.visible = self._alone.visible = len(names) > 1
+        options: list[Any] = [(str(lane), name) for lane, name in enumerate(names)]
+        if options and self._which_lane.options != options:
+            self._which_lane.options = options
+        for part in (self._gains, self._hand, self._tune):
+            part.look()
+        low, high = LIMITS_PER_LANE
+        limits = [(view.parameter(name), view.loop.steering.plant.get(name)) for name in (low, high)]
+        lower, upper = ([float(one) for one in found if one is not None] for found in limits)
+        limited = max(lower, default=-math.inf), min(upper, default=math.inf)
+        self._plots.fit_effort(limited, view.parameter("kp") or 1.0)
+        self._plots.show_steps(self._steps.latest, self._steps.previous)
         self._numbers.text = self._numbers_text()
         self._nodes.text = self._nodes_text()
-        terms = list(self._observer.terms)[-ROLLOVER // 4 :]
-        if terms:
-            lane = min(self._lane, terms[-1][1].shape[1] - 1)
-            p, i, d = (np.array([values[k, lane] for _, values in terms]) for k in (2, 3, 4))
-            self._terms.data = {"t": np.array([time for time, _ in terms]), "p": p, "i": i, "d": d}
-
-    def _show_values(self) -> None:
-        """Set widgets to what the controller has, and reasons beside what it refused."""
-        steering = self._steering
-        for name, reason in self._reasons.items():
-            names = [name] if name != "other" else [n for n in steering.problems if n not in self._reasons]
-            found = "; ".join(steering.problems[n] for n in names if n in steering.problems)
-            reason.update(text=html.escape(found), visible=bool(found))
-        if not steering.values:
-            return
-        for name in PER_LANE:
-            value = self._scalar(name)
-            refused = name in steering.problems
-            if value is not None and (self._shown.get(name) != value or refused):
-                self._shown[name] = value
-                self._fit_slider(name, value)
-                self._fields[name].value = value
-            used = name == "sigma" if steering.values["type"] != "pid" else False
-            self._sliders[name].disabled = not (name in TUNED[steering.values["type"]] or used)
-        for widget, attribute, name in (
-            (self._type, "value", "type"),
-            (self._manual, "active", "manual"),
-        ):
-            if self._shown.get(name) != steering.values[name] or name in steering.problems:
-                self._shown[name] = steering.values[name]
-                setattr(widget, attribute, steering.values[name])
-        for span, limit in zip(self._limits, ("effort_min", "effort_max"), strict=True):
-            value = self._scalar(limit)
-            span.location = value if value is not None and math.isfinite(value) else math.nan
-
-    def _show_step(self) -> None:
-        for source, one in ((self._latest_step, self._steps.latest), (self._previous_step, self._steps.previous)):
-            if one is None:
-                continue
-            stride = max(1, len(one.time) // 1000)
-            source.data = {"t": one.time[::stride], "y": one.output[::stride]}
 
     def _numbers_text(self) -> str:
         parts = []
-        step = self._steps.latest
+        steering, step = self._view.loop.steering, self._steps.latest
         measured = step and step.metrics(self._period * self._steps.stride)
         if measured:
             settled = "not settled yet" if measured.settling_time_s is None else f"{measured.settling_time_s:.3g} s"
@@ -369,62 +164,21 @@ class LivePage:
                 f"<b>latest step</b> overshoot {measured.overshoot_percent:.1f} %, settling time {settled}, "
                 f"IAE {measured.iae:.4g}"
             )
-        margins = self._steering.margins
+        margins = of_lane(steering.margins, self._view.lane) if steering.margins else None
         if margins is not None and margins.stable:
             delay = "no limit" if margins.delay_margin_s is None else f"{margins.delay_margin_s:.3g} s"
             parts.append(f"<b>margins</b> M_s {margins.m_s:.2f}, delay margin {delay}")
         elif margins is not None:
             parts.append(f'<b>margins</b> <span class="refused">{html.escape(str(margins.reason))}</span>')
         else:
-            parts.append(f"<b>margins</b> {html.escape(self._steering.why_no_margins)}")
-        if not self._observer.runs:
+            parts.append(f"<b>margins</b> {html.escape(steering.why_no_margins)}")
+        if not self._view.loop.observer.runs:
             parts.insert(0, f'<span class="refused">{DOWN}</span>')
         return " · ".join(parts)
 
     def _nodes_text(self) -> str:
         lines = [
             f"<b>{html.escape(name)}</b> {html.escape(state.text)}"
-            for name, state in sorted(self._observer.nodes.items())
+            for name, state in sorted(self._view.loop.observer.nodes.items())
         ]
         return "<br>".join(lines) or "No node of this loop has said anything yet."
-
-
-def _given(take: Callable[[float], None]) -> Handler:
-    """What a field does with a new value; an empty field means nothing."""
-
-    def on_change(_: str, __: Any, new: float | None) -> None:
-        if new is not None:
-            take(new)
-
-    return on_change
-
-
-def _some(rows: list[Row]) -> list[Row]:
-    stride = -(-len(rows) // MOST_AT_ONCE)
-    return rows[-1::-stride][::-1]
-
-
-def _at(values: np.ndarray, lane: int) -> float:
-    """A lane's value; a single one stands for all lanes; nan where there is none."""
-    if not len(values):
-        return math.nan
-    return float(values[lane] if lane < len(values) else values[-1])
-
-
-def _columns(rows: list[Row], lane: int) -> dict[str, list[float]]:
-    return {
-        "t": [one.time for one in rows],
-        "r": [_at(one.setpoint, lane) for one in rows],
-        "y": [_at(one.output, lane) for one in rows],
-        "u": [_at(one.effort, lane) for one in rows],
-        "applied": [_at(one.applied, lane) for one in rows],
-    }
-
-
-def _free(folder: Path, name: str, ending: str) -> Path:
-    """A file that is not there yet."""
-    for number in range(1, 10_000):
-        path = folder / f"{name}-{number}{ending}"
-        if not path.exists():
-            return path
-    raise FileExistsError(f"{folder}: there are too many {name}-….{ending} already")

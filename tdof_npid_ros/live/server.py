@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import socket
 from collections.abc import Callable
@@ -30,6 +31,7 @@ class LiveServer:
     """
 
     def __init__(self, page: Callable[[Document], object], port: int = 0) -> None:
+        logging.getLogger("bokeh").setLevel(logging.ERROR)  # a browser that is closed is nothing to tell of
         token = secrets.token_urlsafe(16)
         port = _bindable(port)
         self._server: Any = Server(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from tdof_npid_ros.plants.catalog import effort_limits, model_table
 from tdof_npid_ros.stability.margins import Margins, margins
 
 LOOK_PERIOD = 1.0  # s between two looks at the parameters: somebody else may change them, too
+MOST_MARGINS = 16  # lanes of which margins are computed
 CONTROLLER_NAMES = (*GAIN_NAMES, *OPTION_NAMES, "sample_period", "setpoint")
 
 
@@ -38,7 +39,8 @@ class Steering:
         plant: the plant's; empty where there is none that answers.
         history: of the gains; None before the controller has answered.
         problems: why a change was refused, by parameter; what is not a parameter bears its own name.
-        margins: of the gains now set; None where they are not known, and then `why_no_margins`.
+        margins: of the gains now set, by lane, one where all lanes have the same; empty where they are not known, and
+            then `why_no_margins`.
     """
 
     def __init__(self, observer: LoopObserver, case: Case | None = None) -> None:
@@ -47,7 +49,7 @@ class Steering:
         self.plant: dict[str, Any] = {}
         self.history: GainHistory | None = None
         self.problems: dict[str, str] = {}
-        self.margins: Margins | None = None
+        self.margins: tuple[Margins, ...] = ()
         self.why_no_margins = "the plant's parameters are not known yet"
         self._tasks: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._margins_of: tuple[Any, ...] = ()
@@ -81,13 +83,13 @@ class Steering:
 
         self._tasks.put(reset)
 
-    def setpoint(self, value: float) -> None:
-        """Give a setpoint, on the topic."""
-        self._observer.publish("setpoint", [value])
+    def setpoint(self, values: Sequence[float]) -> None:
+        """Give a setpoint, on the topic: one value, or one for each lane."""
+        self._observer.publish("setpoint", values)
 
-    def disturbance(self, value: float) -> None:
+    def disturbance(self, values: Sequence[float]) -> None:
         """Give a disturbance, on the topic."""
-        self._observer.publish("disturbance", [value])
+        self._observer.publish("disturbance", values)
 
     def keep(self, path: Path) -> None:
         """Write the controller's parameters as a file that every command takes.
@@ -195,6 +197,6 @@ class Steering:
                 episodes={},
                 options=options,
             )
-            self.margins = margins(case, gains)
+            self.margins = tuple(margins(case, gains, lane) for lane in range(min(gains.lanes, MOST_MARGINS)))
         except ValueError as error:
-            self.margins, self.why_no_margins = None, str(error)
+            self.margins, self.why_no_margins = (), str(error)

@@ -56,7 +56,9 @@ class Steps:
     def take(self, time: float, episode: int, setpoint: float, output: float) -> None:
         """Note an answer."""
         is_new = episode != self._episode
-        before = output if is_new or self._setpoint is None else self._setpoint
+        before = output if is_new else self._setpoint
+        if self._setpoint is None or before is None:  # how long this setpoint has stood is not known
+            before = setpoint
         size = max(abs(before), abs(setpoint), LEAST)
         if abs(setpoint - before) > LEAST * size:
             if self.latest is not None:

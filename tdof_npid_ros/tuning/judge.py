@@ -8,7 +8,9 @@ allowed. Without a linear model the same is told from the outputs alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +61,11 @@ class Constraints:
             if not least[name] < value < most:
                 unit = {"phase_margin": " degrees", "delay_margin": " s"}.get(name, "")
                 raise TuningError(f"{name} is {value:g}: it must be above {least[name]:g}{unit} and below {most:g}")
+
+    @classmethod
+    def of_search(cls, search: Mapping[str, Any]) -> Constraints:
+        """What a parameter file asks its tuner for; 0 there: nothing."""
+        return cls(**{field.name: search.get(field.name) or None for field in fields(cls)})
 
     @property
     def given(self) -> dict[str, float]:

@@ -102,6 +102,20 @@ class TuningProblem:
         """The fields alone: the rest follows from them where it is needed."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
+    @classmethod
+    def of_case(cls, case: Case, controller: ControllerType, **search: Any) -> TuningProblem:
+        """The problem as the case's file asks its tuner: with its weight, what it frees and the margins it wants.
+
+        Args:
+            search: attributes of how the search is done.
+
+        Raises:
+            TuningError: as for the class.
+        """
+        free = case.search.get("free") if controller != "pid" else None
+        constraints = Constraints.of_search(case.search)
+        return cls(case, controller, (free,) if free else (), case.weight, constraints=constraints, **search)
+
     def _check_bounds(self) -> None:
         bounds = dict(zip(self.names, self.bounds, strict=True))
         kp, ki, kd = (bounds[name] for name in ("kp", "ki", "kd"))

@@ -2,90 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from browser import chromium_page
-from dds_domain import reserved_domain
+from live_program import CHROMIUM, Program, eventually, model, needs_chromium, opened
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.parameter_file import read_parameters
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
-START_TIMEOUT = 90.0
 pytestmark = pytest.mark.timeout(240)
-
-
-class Program:
-    """`tdof-npid live` in a folder of its own."""
-
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        number, self._domain = reserved_domain()
-        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        self.folder = folder
-        command = [sys.executable, "-m", "tdof_npid_ros", "live", *arguments, "--no-browser", "--json"]
-        self._errors = (folder / "errors.txt").open("w")
-        self.process = subprocess.Popen(
-            command, cwd=folder, env=self.environment, stdout=subprocess.PIPE, stderr=self._errors, text=True
-        )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, (folder / "errors.txt").read_text()
-        self.url = str(json.loads(line)["url"])
-
-    def tdof_npid(self, *arguments: str) -> Any:
-        """What another subcommand says of the loop, as JSON."""
-        command = [sys.executable, "-m", "tdof_npid_ros", *arguments, "--namespace", "/live", "--json"]
-        done = subprocess.run(
-            command, env=self.environment, cwd=self.folder, capture_output=True, text=True, timeout=60
-        )
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout)
-
-    def nodes(self) -> list[int]:
-        """Processes that it has started and that still run."""
-        found = subprocess.run(
-            ["pgrep", "-f", "tdof_npid_ros.graph .*__ns:=/live"], capture_output=True, text=True
-        ).stdout
-        mine = f"ROS_DOMAIN_ID={self.environment['ROS_DOMAIN_ID']}\0"
-        return [pid for pid in map(int, found.split()) if mine in _environment_of(pid)]
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        """Signal it, and wait for its end; its status."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-        status = self.process.wait(timeout=60)
-        self._errors.close()
-        return status
-
-
-def _environment_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/environ").read_text(errors="replace") + "\0"
-    except OSError:
-        return ""
-
-
-def eventually(condition: Any, what: Any, timeout: float = 90.0) -> None:
-    """Wait for a condition; `what` is told if it does not come, a function's result as it is then."""
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, what() if callable(what) else what
-        time.sleep(0.1)
 
 
 @pytest.fixture
@@ -93,19 +28,6 @@ def program(tmp_path: Path) -> Iterator[Program]:
     one = Program(tmp_path, "p1-c0.5")
     yield one
     one.stop()
-
-
-def model(page: Any, name: str, expression: str) -> Any:
-    """Evaluate an expression of a widget `w` by its name."""
-    return page.evaluate(
-        f"(() => {{ const w = Bokeh.documents[0].get_model_by_name('{name}'); return {expression}; }})()"
-    )
-
-
-def opened(page: Any, url: str) -> None:
-    page.goto(url, timeout=60_000)
-    page.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle", timeout=60_000)
-    page.wait_for_function("Bokeh.documents[0].get_model_by_name('kp_field').value !== null", timeout=60_000)
 
 
 @pytest.mark.parametrize("asked", [("set", "kpp=5"), ("get", "kpp")])
@@ -228,3 +150,16 @@ def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "tdof_npid_ros", "live", "--join", "/nobody", "--port", port, "--no-browser"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and f"port {port} cannot be had" in done.stderr
+
+
+def test_without_a_display_the_address_is_told(tmp_path: Path) -> None:
+    hidden = {"DISPLAY", "WAYLAND_DISPLAY", "BROWSER"}
+    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {"TERM": "dumb"}
+    command = [sys.executable, "-m", "tdof_npid_ros", "live", "--join", "/nobody"]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        lines = [program.stdout.readline() for _ in range(6)]
+        program.send_signal(signal.SIGINT)
+        assert program.wait(timeout=60) == 0
+    assert lines[2].strip().startswith("http://127.0.0.1:")
+    assert lines[5] == "No browser could be opened: open the address yourself.\n"

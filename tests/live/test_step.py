@@ -14,7 +14,9 @@ PERIOD = 0.01
 def fed(
     steps: Steps, setpoint: float, seconds: float, start: float = 0.0, level: float = 0.0, episode: int = 0
 ) -> None:
-    """An output that follows a step from `level` with a time constant of 0.2 s."""
+    """An output that follows a step from `level`, which has stood, with a time constant of 0.2 s."""
+    if steps.latest is None:
+        steps.take(start - PERIOD, episode, level, level)
     for t in np.arange(0.0, seconds, PERIOD):
         steps.take(start + t, episode, setpoint, level + (setpoint - level) * (1.0 - np.exp(-t / 0.2)))
 
@@ -37,6 +39,13 @@ def test_a_new_episode_steps_from_its_output() -> None:
     fed(steps, 1.0, 1.0)
     fed(steps, 1.0, 1.0, start=1.0, level=0.5, episode=1)
     assert steps.latest is not None and steps.latest.before == 0.5
+
+
+def test_a_loop_that_is_joined_on_its_way_shows_no_step_that_was_not_seen() -> None:
+    steps = Steps()
+    for k in range(100):
+        steps.take(k * PERIOD, 0, 2.0, 1.5)
+    assert steps.latest is None
 
 
 def test_a_setpoint_that_stays_is_no_step() -> None:

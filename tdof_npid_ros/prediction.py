@@ -1,0 +1,93 @@
+"""What gains are predicted to do in a case: responses to look at, and numbers to compare, before they run a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
+from tdof_npid_ros.loop import Trajectory
+from tdof_npid_ros.metrics import in_units
+from tdof_npid_ros.plotting import Curve, Panel
+from tdof_npid_ros.stability.margins import Margins, margins
+
+METRICS = {
+    ("setpoint", "overshoot_percent"): "setpoint: overshoot (%)",
+    ("setpoint", "settling_time_s"): "setpoint: settling time (s)",
+    ("setpoint", "iae"): "setpoint: IAE",
+    ("disturbance", "peak"): "disturbance: peak",
+    ("disturbance", "recovery_time_s"): "disturbance: recovery time (s)",
+    ("disturbance", "iae"): "disturbance: IAE",
+}
+Runs = dict[str, dict[str, Trajectory]]
+"""By episode, by what the gains are called."""
+
+
+def simulated(case: Case, of: Mapping[str, Gains]) -> Runs:
+    """Every episode of a case under every one of these gains.
+
+    Args:
+        of: gains of one lane, by what they are called.
+    """
+    return {name: {label: case.simulate(name, gains) for label, gains in of.items()} for name in case.plans}
+
+
+def panels(case: Case, runs: Runs) -> list[Panel]:
+    """A picture's panel for each episode."""
+    low, high = (float(case.gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
+    limits = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
+    return [
+        Panel(
+            name,
+            [
+                Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance)
+                for label, run in under.items()
+            ],
+            limits,
+        )
+        for name, under in runs.items()
+    ]
+
+
+def numbers(case: Case, of: Mapping[str, Gains]) -> list[list[str]]:
+    """Metrics and margins as a table, titles first, one column for each of the gains.
+
+    Raises:
+        PlanError, GainsError: the case's episodes are not what the metrics are of.
+    """
+    found = {
+        label: {
+            "setpoint": asdict(case.setpoint_response(gains)),
+            "disturbance": asdict(case.disturbance_response(gains)),
+        }
+        for label, gains in of.items()
+    }
+    rows = [
+        [title, *("-" if (v := each[episode][name]) is None else shown(name, v) for each in found.values())]
+        for (episode, name), title in METRICS.items()
+    ]
+    each_margins = [margins(case, gains) for gains in of.values()]
+    rows += [
+        [title, *(_margin(one, name) for one in each_margins)]
+        for name, title in {"m_s": "M_s", "delay_margin_s": "delay margin (s)"}.items()
+    ]
+    return [["", *of], *rows]
+
+
+def gains_table(of: Mapping[str, Gains]) -> list[list[str]]:
+    """The gains side by side, titles first."""
+    return [["", *of], *([name, *(f"{getattr(gains, name):g}" for gains in of.values())] for name in PER_LANE)]
+
+
+def shown(name: str, value: float) -> str:
+    """A metric for people; a percentage needs no digits below the table's."""
+    return f"{value:.4f}" if name.endswith("_percent") and abs(value) < 1e6 else in_units(value)
+
+
+def _margin(found: Margins, name: str) -> str:
+    value: Any = getattr(found, name)
+    if not found.stable:
+        return "unstable" if found.stable is False else "not known"
+    return "no limit" if value is None else f"{value:.3g}"
