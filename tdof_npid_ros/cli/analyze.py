@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
-import sys
 from pathlib import Path
 
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.choice import add_choice, choice
+from tdof_npid_ros.cli.terminal import width
 from tdof_npid_ros.output_file import check_outputs
 
 
@@ -47,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(report.as_json(), allow_nan=False))
         return 0
-    print(report.table(shutil.get_terminal_size().columns if sys.stdout.isatty() else None))
+    print(report.table(width()))
     for path in written:
         print(f"written: {path}")
     return 0

@@ -7,6 +7,7 @@ import json
 
 from tdof_npid_ros.advice import advice
 from tdof_npid_ros.case import load_case
+from tdof_npid_ros.cli.terminal import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({"case": case.name, "advice": [one._asdict() for one in found]}))
     else:
         for one in found:
-            print(f"{one.severity:8} {one.about}: {one.text}.\n{'':8} → {one.remedy}.")
+            say([f"{one.severity:8}  {one.about}: {one.text}.", f"{'':8}  → {one.remedy}."])
         if not found:
             print(f"{case.name}: nothing to say against it.")
     return int(any(one.severity == "error" for one in found))

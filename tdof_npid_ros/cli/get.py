@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from tdof_npid_ros.cli.loop_client import add_loop_arguments, client_of
+from tdof_npid_ros.cli.terminal import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,5 +30,5 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(found, default=str))
     else:
-        print("\n".join(f"{name} = {value}" for name, value in found.items()))
+        say(f"{name} = {value}" for name, value in found.items())
     return 0

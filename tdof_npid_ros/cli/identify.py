@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from tdof_npid_ros.cli.choice import add_choice, choice
+from tdof_npid_ros.cli.terminal import say
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.identify import identify
 from tdof_npid_ros.identification.records import read_records
@@ -56,11 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(as_json(found, draft), allow_nan=False))
         return 0
-    for note in dict.fromkeys(note for record in records for note in record.notes):
-        print(f"note: {note}")
-    print(table(found))
-    if draft is None:
-        print(text)
+    say(f"note: {note}" for note in dict.fromkeys(note for record in records for note in record.notes))
+    say([*table(found).splitlines(), *([text] if draft is None else [])])
     for path in (arguments.out, arguments.plot):
         if path is not None:
             print(f"written: {path}")

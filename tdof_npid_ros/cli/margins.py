@@ -9,6 +9,7 @@ from pathlib import Path
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
 from tdof_npid_ros.cli.simulate import title
+from tdof_npid_ros.cli.terminal import say
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.stability.margins import margins
@@ -36,5 +37,5 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(loop_report(case, gains) | {"margins": found.as_dict()}, allow_nan=False))
     else:
-        print("\n".join([headline(case, gains), *(f"  {line}" for line in found.lines())]))
+        say([headline(case, gains), *(f"  {line}" for line in found.lines())])
     return 0

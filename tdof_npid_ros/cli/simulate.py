@@ -16,6 +16,7 @@ import numpy as np
 from tdof_npid_ros.advice import gravest
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline, loop_report
+from tdof_npid_ros.cli.terminal import say
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.interactive import Page, response_plots
 from tdof_npid_ros.metrics import in_units
@@ -49,7 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     report = response_report(case, gains) | {"margins": found.as_dict()} | advised(case, gains)
     write_responses(case, {title(gains): gains}, arguments)
     lines = [headline(case, gains), *_table(report), *(f"  margins      {line}" for line in found.lines())]
-    print(json.dumps(report) if arguments.json else "\n".join(lines))
+    if arguments.json:
+        print(json.dumps(report))
+    else:
+        say(lines)
     return 0
 
 
