@@ -40,10 +40,16 @@ bench-long: $(VENV)/.bench
 bench-small: $(VENV)/.bench
 	$(BIN)/python -m benchmarks --size small --all --out $(VENV)/bench-small
 
+# pip tells its progress on a terminal, in its own bars; in a log, a line for each package would be too much.
+QUIET = $(shell test -t 2 || echo --quiet)
+
 $(VENV)/.run: setup.py
+	@echo "Setting up $(VENV): Python packages and ROS 2 Jazzy from PyPI, this once."
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
+	@echo "[1/2] pip"
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet --editable ".[ros]"
+	@echo "[2/2] tdof_npid_ros with ROS 2"
+	$(BIN)/pip install $(QUIET) --editable ".[ros]"
 	touch $@
 
 $(VENV)/.paper: $(VENV)/.run

@@ -557,7 +557,8 @@ RECORDER: Final = table(
     Parameter(
         "topics",
         ["*", "/parameter_events", "/rosout", "/diagnostics", "/clock"],
-        "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace",
+        "patterns (* ? [...]) of the topics to record; those without a slash at the start are of this namespace, "
+        "without other loops below it",
         fixed=True,
     ),
     Parameter("exclude", [""], "patterns of topics to leave out", fixed=True),

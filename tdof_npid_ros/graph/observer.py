@@ -114,8 +114,7 @@ class LoopObserver:
         self._latest_answer = 0.0
         self._remotes: dict[str, RemoteNode] = {}
         self._publishers = {
-            topic: self.node.create_publisher(JointState, topic, TOLD)
-            for topic in ("setpoint", "disturbance", "manual_effort")
+            topic: self.node.create_publisher(JointState, topic, TOLD) for topic in ("setpoint", "disturbance")
         }
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._readers = {topic: SignalReader() for topic in ("output", "control_effort", "controller_state")}
@@ -232,7 +231,7 @@ class LoopObserver:
         return self._remotes[node]
 
     def publish(self, topic: str, values: Sequence[float]) -> None:
-        """Give a setpoint, disturbance or manual effort on its topic: one value, or one per lane."""
+        """Give a setpoint or a disturbance on its topic: one value, or one per lane."""
         message = signal_message("")
         message.header.stamp = self.node.get_clock().now().to_msg()
         setattr(message, "position" if topic == "setpoint" else "effort", [float(value) for value in values])

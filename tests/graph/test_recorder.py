@@ -17,6 +17,8 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.analysis.verify import verify
 from tdof_npid_ros.bag.reader import BagReader
+from tdof_npid_ros.graph.recorder.wanted import is_wanted, other_loops
+from tdof_npid_ros.wire import JOINT_STATE
 
 STEPS = int(os.environ.get("RECORDED_STEPS", 2_000))  # 100_000 for the full run
 CASE = "p1-c0.5"
@@ -82,6 +84,17 @@ def test_topics_by_pattern_and_a_new_file_at_a_size(graph: Any, tmp_path: Path) 
         assert len(np.unique(reader.columns("/output", ["header.stamp"])["header.stamp"])) == 1001
     sizes = [path.stat().st_size for path in (tmp_path / "bag").glob("*.mcap")]
     assert len(sizes) > 4 and max(sizes) < 60_000
+
+
+def test_a_loop_in_the_root_namespace_records_no_other_loop() -> None:
+    names = ["/output", "/control_effort", "/plant/transition_event", "/left/output", "/left/control_effort"]
+    topics = [(name, [JOINT_STATE]) for name in names]
+    others = other_loops(topics, "/")
+    default = ["*", "/parameter_events"]
+    assert [name for name in names if is_wanted(name, "/", default, [""], others)] == names[:3]
+    assert is_wanted("/left/output", "/", ["/left/*"], [""], others)
+    assert is_wanted("/left/output", "/left", default, [""], other_loops(topics, "/left"))
+    assert not is_wanted("/output", "/", default, ["output"], others)
 
 
 def test_losses_are_counted_and_told(graph: Any, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from fnmatch import fnmatchcase
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,13 @@ from tdof_npid_ros.bag.qos import QosProfile
 from tdof_npid_ros.bag.writer import BagWriter
 from tdof_npid_ros.graph.recorder.lossless import NO_LOG, TOPIC
 from tdof_npid_ros.graph.recorder.snapshot import ParameterSnapshots
+from tdof_npid_ros.graph.recorder.wanted import is_wanted, other_loops
 from tdof_npid_ros.graph.runtime.messages import set_stamp, signal_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, LoopNode
 from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.graph.runtime.tap import LogProgress, Taken, Tap, TapThread
 from tdof_npid_ros.interfaces import message_class
-from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import RECORDER
 from tdof_npid_ros.wire import JOINT_STATE
@@ -159,17 +159,13 @@ class RecorderNode(LoopNode):
         if self.calm_looks > CALM_LOOKS:
             return
         self.graph = graph
+        others = other_loops(topics, self.get_namespace())
         for topic, types in topics:
-            if topic not in self.not_recorded and self._wanted(topic):
+            if topic not in self.not_recorded and self._wanted(topic, others):
                 self._follow(topic, types)
 
-    def _wanted(self, topic: str) -> bool:
-        namespace = in_namespace(self.get_namespace())
-
-        def among(patterns: list[str]) -> bool:
-            return any(fnmatchcase(topic, p if p.startswith("/") else namespace + p) for p in patterns if p)
-
-        return among(self.topics) and not among(self.exclude)
+    def _wanted(self, topic: str, others: Sequence[str] = ()) -> bool:
+        return is_wanted(topic, self.get_namespace(), self.topics, self.exclude, others)
 
     def _follow(self, topic: str, types: list[str]) -> None:
         """Subscribe to a topic, or again if a publisher offers less than what was asked for."""
