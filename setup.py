@@ -29,6 +29,7 @@ BENCH = [
     "mcap-ros2-support==0.6.0",
     "rosbags==0.11.9",
 ]
+EXAMPLES = ["mujoco-core>=4; python_version >= '3.11'"]  # without its viewers: 10 MB
 TEST = [
     "pytest>=8",
     "pytest-timeout",
@@ -67,6 +68,8 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", [str(path) for path in Path("config").glob("*.*")]),
         (f"share/{NAME}/config/sros2", [str(path) for path in Path("config/sros2").glob("*.xml")]),
+        (f"share/{NAME}/examples", [str(path) for path in Path("examples").glob("*.*")]),
+        (f"share/{NAME}/examples/arm", [str(path) for path in Path("examples/arm").glob("*.*")]),
         (f"share/{NAME}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
     ],
     python_requires=">=3.10",

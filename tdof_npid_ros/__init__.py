@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tdof_npid_ros.case import make_case as make_case
     from tdof_npid_ros.control.gains import Gains as Gains
     from tdof_npid_ros.control.options import ControllerOptions as ControllerOptions
+    from tdof_npid_ros.graph.running import run as run
     from tdof_npid_ros.interface import read_bag as read_bag
     from tdof_npid_ros.interface import simulate as simulate
     from tdof_npid_ros.interface import sweep as sweep
@@ -42,6 +43,7 @@ _HOMES = {
     "make_case": "case",
     "margins": "stability.margins",
     "read_bag": "interface",
+    "run": "graph.running",
     "simulate": "interface",
     "sweep": "interface",
     "tune": "interface",

@@ -25,6 +25,7 @@ NO_VALUES = np.empty(0)
 
 
 NO_PLAN: Final = "-"  # in a label, in place of a plan's digest
+_DIGEST: Final = re.compile("[0-9a-f]{12}")
 _LABEL: Final = re.compile(r"(?:([0-9a-f]{12})|-)/([0-9a-z]+)\.([0-9]{1,18})")
 _OLD_LABEL: Final = re.compile(r"([0-9a-f]{12})/([0-9]{1,18})")  # <plan>/<number>, in recordings of before 2027
 _REMEMBERED: Final = 256  # labels that need not be parsed again; at any time a loop has two
@@ -75,6 +76,11 @@ class AnswerLabel(NamedTuple):
 
     parameters: str
     episode: EpisodeLabel | None = None
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it begins with what a digest of parameters is; a robot's frames do not."""
+        return _DIGEST.fullmatch(self.parameters) is not None
 
     @staticmethod
     def parse(text: str) -> AnswerLabel:

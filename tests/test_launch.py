@@ -40,8 +40,9 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> None:
     names: dict[str, dict[str, Any]] = {
         "launch": {"LaunchDescription": maker("LaunchDescription")},
         "launch.actions": {name: maker(name) for name in ACTIONS},
-        "launch.event_handlers": {"OnProcessIO": maker("OnProcessIO")},
-        "launch.events": {"Shutdown": maker("Shutdown")},
+        "launch.event_handlers": {name: maker(name) for name in ("OnProcessIO", "OnProcessExit")},
+        "launch.events": {"matches_action": lambda action: action},
+        "launch.events.process": {"ShutdownProcess": maker("ShutdownProcess")},
         "launch.substitutions": {"LaunchConfiguration": Configuration},
         "launch_ros": {},
         "launch_ros.actions": {"Node": maker("Node")},
@@ -50,6 +51,7 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> None:
         module = ModuleType(name)
         module.__dict__.update(content)
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "tdof_npid_ros.graph.launching", raising=False)
 
 
 def started(name: str, /, **given: str) -> list[Made]:
@@ -109,8 +111,11 @@ def test_nodes_can_be_left_out() -> None:
 def test_it_ends_when_the_episodes_are_played_unless_it_is_to_stay() -> None:
     (handler,) = (one.args[0] for one in started("loop") if one.kind == "RegisterEventHandler")
     assert handler.target_action.executable == "scenario"
-    (end,) = handler.on_stderr(Made(text=b"[INFO] [1.2] [scenario]: all episodes played\n"))
-    assert end.event.kind == "Shutdown" and not handler.on_stderr(Made(text=b"[INFO] ready"))
+    ends = handler.on_stderr(Made(text=b"[INFO] [1.2] [scenario]: all episodes played\n"))
+    # these nodes, not the whole launch, which another may have included
+    assert [end.event.kind for end in ends] == ["ShutdownProcess"] * 4
+    assert [end.event.process_matcher.executable for end in ends] == ["recorder", "plant", "controller", "scenario"]
+    assert not handler.on_stderr(Made(text=b"[INFO] ready"))
     for stays in (started("loop", stay="true"), started("loop", scenario="false")):
         assert {one.kind for one in stays} == {"Node"}
 
@@ -124,7 +129,34 @@ def test_a_robot_s_controller_is_remapped_and_recorded_if_a_bag_is_given() -> No
     (controller,) = started("controller", params="arm.yaml", name="arm", output="joint_states", setpoint="goal")
     assert controller.remappings == [("output", "joint_states"), ("setpoint", "goal")]
     assert (controller.name, controller.parameters) == ("arm", ["arm.yaml"])
-    _, recorder = started("controller", params="arm.yaml", bag="bags/arm", namespace="left")
+    recorder, _ = started("controller", params="arm.yaml", bag="bags/arm", namespace="left")
     assert (recorder.parameters, recorder.namespace) == ([{"bag": "bags/arm"}], "left")
     with pytest.raises(AssertionError, match="must be given"):
         started("controller")
+
+
+def test_the_tuner_comes_with_its_loop_which_ends_with_it() -> None:
+    plant, controller, tuner, handler = started("tuner", case="p3-c1", type="pid", seed="7", mode="lockstep")
+    assert plant.parameters[1] == {"mode": "lockstep"} and len(controller.parameters) == 1
+    assert tuner.parameters[1] == {"case": "p3-c1", "type": "pid", "seed": 7}
+    for name, value in tuner.parameters[1].items():
+        NODES["tuner"][name].checked(value)
+    assert handler.args[0].target_action is tuner
+    assert [end.event.process_matcher for end in handler.args[0].on_exit] == [plant, controller]
+    assert list(nodes(started("tuner", plant="false", controller="false"))) == ["tuner"]
+
+
+def test_a_replay_comes_alone_or_is_compared_with_a_controller() -> None:
+    (replay,) = started("replay", bag="2024", rate="2.0", loop="true")
+    assert replay.parameters == [{"bag": "2024", "rate": 2.0, "loop": True, "clock": False}]
+    controller, replay, handler = started("replay", bag="bags/first", case="p1-c4")
+    assert Path(controller.parameters[0]).name == "p1-c4.yaml" and replay.parameters[0]["compare"] is True
+    assert handler.args[0].target_action is replay
+    with pytest.raises(AssertionError, match="must be given"):
+        started("replay")
+
+
+@pytest.mark.parametrize("name", ["loop", "controller", "tuner", "replay"])
+def test_each_goes_into_a_namespace(name: str) -> None:
+    given = {"controller": {"params": "arm.yaml", "bag": "x"}, "replay": {"bag": "x", "case": "p1-c4"}}.get(name, {})
+    assert {one.namespace for one in nodes(started(name, namespace="left", **given)).values()} == {"left"}

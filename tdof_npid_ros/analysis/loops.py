@@ -28,7 +28,7 @@ from tdof_npid_ros.analysis.tracks import Track, by_place, on_one_clock
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.field_path import FieldPath, Step
 from tdof_npid_ros.names import namespace_of
-from tdof_npid_ros.wire import JOINT_STATE
+from tdof_npid_ros.wire import JOINT_STATE, AnswerLabel
 
 OUTPUT, SETPOINT, EFFORT, DISTURBANCE = "output", "setpoint", "control_effort", "disturbance"  # as our nodes call them
 NO_OUTPUTS: Final = (SETPOINT, EFFORT, DISTURBANCE, "controller_state", "manual_effort", "tuning_progress")
@@ -228,6 +228,18 @@ def _beside(reader: BagReader, output: Source, role: Role, namespace: str) -> So
         if source.topic != output.topic and is_scalar == is_output_scalar:
             is_ours = _type(reader, source) == JOINT_STATE and leaf_of(source.topic) in (SETPOINT, EFFORT)
             return replace(source, guessed=not is_ours or namespace != output.namespace)
+    return _answers(reader, output, namespace) if role == _EFFORT else None
+
+
+def _answers(reader: BagReader, output: Source, namespace: str) -> Source | None:
+    """Answers of our controller in a namespace, on a topic that bears another name: told by the digest they bear."""
+    for topic, info in sorted(reader.topics.items()):
+        is_signal = info.type == JOINT_STATE and info.count and topic not in reader.unreadable
+        if not is_signal or namespace_of(topic) != namespace or leaf_of(topic) in NO_OUTPUTS or topic == output.topic:
+            continue
+        frames = set(reader.columns(topic, ["header.frame_id"])["header.frame_id"].tolist())
+        if frames and all(AnswerLabel.parse(frame).is_ours for frame in frames):
+            return Source(_EFFORT, _field(topic, "effort"), guessed=True)
     return None
 
 

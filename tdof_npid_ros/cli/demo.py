@@ -8,30 +8,20 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
-from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.gains import gains_by_source
-from tdof_npid_ros.control.gains import PER_LANE, Gains, controller_type
+from tdof_npid_ros.control.gains import Gains, controller_type
 from tdof_npid_ros.paper.tables import COMPARED, published
-from tdof_npid_ros.parameter_file import find_parameter_file
-
-if TYPE_CHECKING:  # rclpy restarts the interpreter when it is imported
-    from tdof_npid_ros.graph.conductor import Conductor
-    from tdof_npid_ros.graph.processes import NodeProcesses
 
 CASE = "p1-c0.5"
 NAMESPACE = "/demo"
 TUNED_TYPE = "tdof_npid2"
 GENERATIONS = 5  # of 40 candidates: a short tuning
-START_TIMEOUT = 60.0  # s; the first start compiles
-PLAY_TIMEOUT = 120.0  # s
-SUBSCRIBERS = {"output": 2, "control_effort": 2, "controller_state": 1, "scenario_plan": 3}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,9 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Tune over ROS 2, then run the published and the tuned gains, recorded, and compare."""
     from tdof_npid_ros.analysis.report import analyze, title
-    from tdof_npid_ros.graph.runtime.middleware import stay_on_this_machine
-
-    stay_on_this_machine()
 
     case = load_case(CASE)
     bag = arguments.bag or Path("bags") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -54,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
         _tune(result, quiet=arguments.json)
         tuned = gains_by_source(case, TUNED_TYPE, str(result))
         rounds = {name: gains_by_source(case, name, "published") for name in COMPARED} | {f"{TUNED_TYPE}, tuned": tuned}
-        _record(case, rounds, bag, quiet=arguments.json)
+        _record(rounds, bag, quiet=arguments.json)
         shutil.copy(result, bag / "tuned.yaml")
     report = analyze([bag])
     picture = bag / "responses.png"
@@ -83,75 +70,43 @@ def _check_free(bag: Path) -> None:
         raise RuntimeError(f"the bag {bag} cannot be written: {error.strerror}") from error
 
 
-@contextmanager
-def _loop(nodes: dict[str, dict[str, Any]]) -> Iterator[tuple[Conductor, NodeProcesses]]:
-    """The nodes, by name with their parameters, as processes, and a conductor for them; all of it ends with the
-    context."""
-    from tdof_npid_ros.graph.conductor import Conductor
-    from tdof_npid_ros.graph.processes import NodeProcesses
-
-    with NodeProcesses(find_parameter_file(CASE), NAMESPACE) as processes:
-        for name, parameters in nodes.items():
-            processes.start(name, parameters, ends=name == "tuner")
-        conductor = Conductor(NAMESPACE, processes.check)
-        try:
-            yield conductor, processes
-        finally:
-            conductor.close()
-
-
 def _tune(result: Path, quiet: bool) -> None:
     """A short run of the tuner node on a loop of its own."""
-    tuner = {"case": CASE, "type": TUNED_TYPE, "generations": GENERATIONS, "result": result}
+    from tdof_npid_ros.graph.running import run as running
+
     if not quiet:
         print(f"Tuning {TUNED_TYPE} through a loop of plant, controller and tuner in {NAMESPACE} …", flush=True)
     with (
-        _loop({"plant": {}, "controller": {}, "tuner": tuner}) as (conductor, processes),
+        running(CASE, namespace=NAMESPACE, nodes=("plant", "controller")) as loop,
         tqdm(total=GENERATIONS, disable=quiet or None, bar_format=_TUNING_BAR, mininterval=_REDRAWN) as bar,
     ):
-
-        def finished() -> bool:
-            best = conductor.fact("tuner", "best")
+        loop.start("tuner", case=CASE, type=TUNED_TYPE, generations=GENERATIONS, result=result)
+        while not loop.has_ended("tuner"):
+            loop.idle(0.05)
+            best = loop.conductor.fact("tuner", "best")
             text = "first generation" if best in ("", "inf") else f"best IAE {best[:7]}"
             bar.set_description(f"{text:16}", refresh=False)
-            bar.update(int(conductor.fact("tuner", "generation") or 0) - bar.n)
-            return processes.has_ended("tuner")
-
-        conductor.wait(finished, "the end of the tuning", PLAY_TIMEOUT)
-        processes.check()
+            bar.update(int(loop.conductor.fact("tuner", "generation") or 0) - bar.n)
 
 
-def _record(case: Case, rounds: dict[str, Gains], bag: Path, quiet: bool) -> None:
+def _record(rounds: dict[str, Gains], bag: Path, quiet: bool) -> None:
     """Play the case's episodes once for each set of gains, recorded, with a progress bar in simulated seconds."""
+    from tdof_npid_ros.graph.running import run as running
+
     if not quiet:
         print(f"Starting plant, controller, scenario and recorder in {NAMESPACE} …", flush=True)
-    lossless = {"lossless": True}
-    nodes: dict[str, dict[str, Any]] = {
-        "recorder": {"bag": bag, **lossless},
-        "plant": lossless,
-        "controller": lossless,
-        "scenario": {"play": False},
-    }
-    with _loop(nodes) as (conductor, _):
-        conductor.wait_for_subscriptions(SUBSCRIBERS, START_TIMEOUT)
-        episode_s = [plan.end_ns / 1e9 for plan in case.plans.values()]
-        with tqdm(
-            total=len(rounds) * sum(episode_s), disable=quiet or None, bar_format=_PLAYING_BAR, mininterval=_REDRAWN
-        ) as bar:
-            for round_, (name, gains) in enumerate(rounds.items()):
-                bar.set_description(f"{name:17}")
-                conductor.set_parameters("controller", {"type": gains.type, **{n: getattr(gains, n) for n in PER_LANE}})
-                conductor.play(PLAY_TIMEOUT)
-
-                def played(round_: int = round_) -> bool:
-                    done = conductor.episodes_finished - round_ * len(episode_s)
-                    if 0 <= done < len(episode_s):
-                        position = round_ * sum(episode_s) + sum(episode_s[:done]) + conductor.time_ns / 1e9
-                        bar.update(max(0.0, min(position, bar.total) - bar.n))
-                    return done == len(episode_s)
-
-                conductor.wait(played, f"the end of the episodes with {name}", PLAY_TIMEOUT)
-            bar.update(bar.total - bar.n)
+    with (
+        running(CASE, bag=bag, namespace=NAMESPACE) as loop,
+        tqdm(disable=quiet or None, bar_format=_PLAYING_BAR, mininterval=_REDRAWN) as bar,
+    ):
+        for round_, (name, gains) in enumerate(rounds.items()):
+            bar.set_description(f"{name:17}")
+            loop.use(gains)
+            loop.play()
+            bar.total = len(rounds) * loop.to_play_s
+            while loop.is_playing:
+                loop.idle(0.05)
+                bar.update(max(0.0, round_ * loop.to_play_s + loop.played_s - bar.n))
 
 
 _REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable

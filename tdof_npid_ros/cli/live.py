@@ -62,12 +62,12 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.join is None and case is not None and path is not None:
             stay_on_this_machine()
             processes = stack.enter_context(NodeProcesses(path, NAMESPACE))
-            common: dict[str, Any] = {"mode": arguments.mode, "speed": arguments.speed}
+            given: dict[str, Any] = {"mode": arguments.mode, "speed": arguments.speed}
             plays = arguments.mode == "lockstep"
             # Until somebody steps the setpoint, the loop stays where the plant begins.
             stays = not plays and "setpoint" not in read_parameters(path, "controller")
-            setpoint = {"setpoint": case.plant.initial_output} if stays else {}
-            start_nodes(processes, case, path, arguments.bag, common, play=plays, controller=setpoint)
+            given |= {"setpoint": case.plant.initial_output} if stays else {}
+            start_nodes(processes, case, path, arguments.bag, given, play=plays)
         loops += [stack.enter_context(closing(LiveLoop(namespace, case, path))) for namespace in namespaces]
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)

@@ -55,17 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _play(loop: RunningLoop, seconds: float | None, quiet: bool) -> bool:
     """Play all episodes with a progress bar; whether they have ended by themselves."""
-    ends = [plan.end_ns / 1e9 for plan in loop.case.plans.values()]
     deadline = None if seconds is None else time.monotonic() + seconds
     loop.play()
-    first = loop.conductor.label.number if loop.conductor.label else 1
-    with tqdm(total=sum(ends), disable=quiet or None, bar_format=BAR, mininterval=REDRAWN) as bar:
+    with tqdm(total=loop.to_play_s, disable=quiet or None, bar_format=BAR, mininterval=REDRAWN) as bar:
         while loop.is_playing:
             if deadline is not None and time.monotonic() > deadline:
                 return False
             loop.idle(0.1)
-            done = min(max((loop.conductor.label.number if loop.conductor.label else first) - first, 0), len(ends) - 1)
-            position = sum(ends[:done]) + min(loop.conductor.time_ns / 1e9, ends[done])
-            bar.update(max(0.0, position - bar.n))
-        bar.update(bar.total - bar.n)
+            bar.update(max(0.0, loop.played_s - bar.n))
     return True

@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.law import TERMS
-from tdof_npid_ros.graph.runtime.messages import node_of, signal_message
+from tdof_npid_ros.graph.runtime.messages import given_message, node_of
 from tdof_npid_ros.graph.runtime.middleware import use_fast_dds_profile
 from tdof_npid_ros.graph.runtime.parameter_client import RemoteNode
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
@@ -232,10 +232,7 @@ class LoopObserver:
 
     def publish(self, topic: str, values: Sequence[float]) -> None:
         """Give a setpoint or a disturbance on its topic: one value, or one per lane."""
-        message = signal_message("")
-        message.header.stamp = self.node.get_clock().now().to_msg()
-        setattr(message, "position" if topic == "setpoint" else "effort", [float(value) for value in values])
-        self._publishers[topic].publish(message)
+        self._publishers[topic].publish(given_message(topic, values, self.node))
 
     def heard(self, topic: str) -> bool:
         """Whether somebody listens to what is published on a topic."""

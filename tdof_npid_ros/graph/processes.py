@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from tdof_npid_ros.graph.__main__ import PARENT
-from tdof_npid_ros.parameter_file import write_parameters
+from tdof_npid_ros.parameter_file import read_parameters, write_parameters
 
 STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
 
@@ -54,11 +54,12 @@ class NodeProcesses:
     Args:
         parameter_file: given to every node.
         namespace: in which they run.
+        remap: topics that they call otherwise, by the names that they have here.
     """
 
-    def __init__(self, parameter_file: Path, namespace: str = "/") -> None:
+    def __init__(self, parameter_file: Path, namespace: str = "/", remap: Mapping[str, str] | None = None) -> None:
         self._parameter_file = parameter_file
-        self._namespace = namespace
+        self._names = {"__ns": namespace, **(remap or {})}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._end_by_themselves: set[str] = set()
         self._logs = Path(tempfile.mkdtemp(prefix="tdof-npid-"))
@@ -68,18 +69,19 @@ class NodeProcesses:
 
         Args:
             node: plant, controller, scenario, tuner, recorder or replay.
-            parameters: by name, after those of the file.
+            parameters: by name, in place of those of the file.
             ends: it ends by itself when it is done; every other node that ends has failed.
         """
         if ends:
             self._end_by_themselves.add(node)
-        command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "-r", f"__ns:={self._namespace}"]
-        command += ["--params-file", str(self._parameter_file)]
-        if parameters:  # in a file, whose entries stand above the first one's whatever the namespace
-            path = self._logs / f"{node}.yaml"
-            plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
-            write_parameters(path, {node: plain})
-            command += ["--params-file", str(path)]
+        file = self._parameter_file
+        if parameters:  # one file: of a number in one file and a list in another, ROS takes the number
+            values = {**read_parameters(file, node), **parameters}
+            plain = {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+            file = self._logs / f"{node}.yaml"
+            write_parameters(file, {node: plain})
+        command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "--params-file", str(file)]
+        command += [word for name, other in self._names.items() for word in ("-r", f"{name}:={other}")]
         with self.log(node).open("wb") as log, _interrupted_afterwards():
             # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
             self._processes[node] = subprocess.Popen(

@@ -480,3 +480,14 @@ def test_a_second_publisher_and_a_profile_that_does_not_fit_are_reported(graph: 
     graph.node.create_publisher(JointState, "setpoint", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     graph.wait_for_log(controller, "/setpoint: /test offers best_effort, volatile, but /controller requests reliable")
     assert int(graph.fact("/controller", "conflicts")) >= 1
+
+
+def test_a_second_publisher_of_the_clock_is_warned_of(graph: Any) -> None:
+    lockstep = {**PLANT, "mode": "lockstep"}
+    graph.start("plant", namespace="/third", **lockstep, publish_clock=False)
+    first = graph.start("plant", namespace="/first", **lockstep)
+    graph.wait_for_nodes("/first/plant", "/third/plant")
+    assert "publish /clock" not in first.log and graph.node.count_publishers("/clock") == 1
+    second = graph.start("plant", namespace="/second", **PLANT, speed=2.0)
+    for plant in (first, second):
+        graph.wait_for_log(plant, "others publish /clock, too, so time jumps: set publish_clock to false")

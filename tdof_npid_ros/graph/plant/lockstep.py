@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from rosgraph_msgs.msg import Clock as ClockMessage
 from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.recorder.lossless import Log
-from tdof_npid_ros.graph.runtime.messages import plan_from_message, set_stamp
+from tdof_npid_ros.graph.runtime.messages import plan_from_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.plants.lockstep import Episode
@@ -32,15 +31,13 @@ class LockstepPlant:
         node = self._node
         self.plan, self.episode = None, None
         self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
-        self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10)
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         node.subscribe_signal("control_effort", self._on_answer, node.requested_qos(), sole=True)
         self.held = False  # an output waits for the log
-        p = node.values_of(["lossless", "reply_timeout", "publish_clock"])
+        p = node.values_of(["lossless", "reply_timeout"])
         self.log = Log(node, self._port.period_ns, self._on_log_grown) if p["lossless"] else None
         node.create_timer(float(p["reply_timeout"]), self._on_reply_timeout, clock=STEADY)
-        if p["publish_clock"]:
-            node.create_timer(CLOCK_PERIOD, self._publish_clock, clock=STEADY)
+        node.create_timer(CLOCK_PERIOD, self._publish_clock, clock=STEADY)
 
     def _on_plan(self, message: JointTrajectory) -> None:
         try:
@@ -162,9 +159,7 @@ class LockstepPlant:
     def _publish_clock(self) -> None:
         if self.episode is not None and self.clock_ns != self.episode.stamp_ns:
             self.clock_ns = self.episode.stamp_ns
-            message = ClockMessage()
-            set_stamp(message.clock, self.clock_ns)
-            self.clock_publisher.publish(message)
+            self._port.publish_clock(self.clock_ns)
 
     def changed(self) -> None:
         """Changed parameters wait for the next episode."""

@@ -12,9 +12,10 @@ from std_srvs.srv import Trigger
 
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.plant.lockstep import LockstepPlant
-from tdof_npid_ros.graph.plant.port import PlantPort
+from tdof_npid_ros.graph.plant.port import TWO_CLOCKS, PlantPort
 from tdof_npid_ros.graph.plant.realtime import RealtimePlant
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
+from tdof_npid_ros.graph.runtime.node import OK, WARN
 from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.parameters import NOISE, PLANT, sample_period_in_ns
@@ -52,7 +53,11 @@ class PlantNode(LoopEnd):
     def activate(self) -> None:
         """Create topics, services and timers."""
         self.prepare_for_realtime()
-        self.port.activate(self.mode == "realtime", self.way_of_running.on_matched)
+        p = self.values_of(["speed", "publish_clock"])
+        realtime = self.mode == "realtime"
+        # At the speed of the wall clock, that is the clock; else time has to be told.
+        is_clock = p["publish_clock"] and not (realtime and p["speed"] == 1.0)
+        self.port.activate(is_clock, realtime, self.way_of_running.on_matched)
         self.create_service(Trigger, "plant/reset", self._on_reset)
         self.way_of_running.activate()
 
@@ -88,6 +93,8 @@ class PlantNode(LoopEnd):
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""
         level, text, facts = self.way_of_running.state()
+        if self.active and self.port.has_rival_clock() and level == OK:
+            level, text = WARN, TWO_CLOCKS
         return level, text, {"mode": self.mode, "lanes": self.port.simulator.lanes, **facts}
 
 

@@ -10,11 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 from diagnostic_msgs.msg import KeyValue
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd
-from tdof_npid_ros.graph.runtime.messages import EPISODE, lane_names
+from tdof_npid_ros.graph.runtime.messages import EPISODE, lane_names, time_message
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.parameters import NOISE
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
@@ -23,6 +24,7 @@ from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.wire import EpisodeLabel, Sample, SignalWriter
 
+TWO_CLOCKS = "others publish /clock, too, so time jumps: set publish_clock to false in all plants but one"
 Phase = Literal["waiting", "running", "stopped", "finished"]
 
 
@@ -53,10 +55,11 @@ class PlantPort:
         self.simulator = self.new_simulator()
         self.simulator.warm_up()
 
-    def activate(self, with_deadline: bool, matched: Callable[[Any], None]) -> None:
+    def activate(self, is_clock: bool, with_deadline: bool, matched: Callable[[Any], None]) -> None:
         """Create the topics `output` and `episode`, and wait.
 
         Args:
+            is_clock: whether it publishes /clock.
             with_deadline: whether `output` promises one.
             matched: told of each subscriber of `output` that comes or goes.
         """
@@ -64,6 +67,8 @@ class PlantPort:
         qos = node.promised_qos(with_deadline=with_deadline)
         self._output_publisher = node.publisher_of(JointState, "output", qos, matched=matched)
         self._episode_publisher = node.create_publisher(KeyValue, EPISODE, LATCHED_QOS)
+        self._clock_publisher = node.create_publisher(Clock, "/clock", 10) if is_clock else None
+        self._two_clocks = False
         self.label = EpisodeLabel("", secrets.token_hex(4), 0)
         self.tell("waiting")
 
@@ -92,6 +97,20 @@ class PlantPort:
         self._output_publisher.publish(
             self._output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
         )
+
+    def publish_clock(self, time_ns: int) -> None:
+        """Publish the loop's time, if it is this plant that does."""
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(Clock(clock=time_message(time_ns)))
+
+    def has_rival_clock(self) -> bool:
+        """Whether somebody else publishes /clock as this plant does; warned of when that begins."""
+        clock = self._clock_publisher
+        rival = clock is not None and self.node.count_publishers(clock.topic_name) > 1
+        if rival and not self._two_clocks:
+            self.node.get_logger().warning(TWO_CLOCKS)
+        self._two_clocks = rival
+        return rival
 
     def takes(self, topic: str, effort: np.ndarray) -> bool:
         """Whether there is one finite value per lane; else it is refused."""

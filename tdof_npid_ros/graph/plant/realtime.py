@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from rosgraph_msgs.msg import Clock as ClockMessage
 
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.runtime.loop_end import patience_ns
-from tdof_npid_ros.graph.runtime.messages import set_stamp
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.realtime import LatestTimes, SteadyRosTime
 from tdof_npid_ros.plants.failsafe import FailSafe
@@ -32,13 +30,10 @@ class RealtimePlant:
         """Create the topics and the timer."""
         node = self._node
         self.period_error, self.output_to_effort = LatestTimes(), LatestTimes()
-        p = node.values_of(["speed", "publish_clock"])
-        self.wall_period_ns = max(1, round(self._port.period_ns / p["speed"]))
+        speed = node.values_of(["speed"])["speed"]
+        self.wall_period_ns = max(1, round(self._port.period_ns / speed))
         self.start_ns = node.get_clock().now().nanoseconds  # the stamp of step 0
-        self.ros_time = SteadyRosTime(self.start_ns, STEADY.now().nanoseconds, p["speed"])
-        # At the speed of the wall clock, that is the clock; else time has to be told.
-        is_clock = p["publish_clock"] and p["speed"] != 1.0
-        self.clock_publisher = node.create_publisher(ClockMessage, "/clock", 10) if is_clock else None
+        self.ros_time = SteadyRosTime(self.start_ns, STEADY.now().nanoseconds, speed)
         self.clock_told_ns = 0
         self.reset()
         node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(as_promised=True), sole=True)
@@ -89,11 +84,9 @@ class RealtimePlant:
         stamp_ns = self.start_ns + self.step * self._port.period_ns
         self._port.publish_output(stamp_ns)
         self.output_ns = stamp_ns, now
-        if self.clock_publisher is not None and now - self.clock_told_ns >= CLOCK_PERIOD_NS:
+        if now - self.clock_told_ns >= CLOCK_PERIOD_NS:
             self.clock_told_ns = now
-            message = ClockMessage()
-            set_stamp(message.clock, stamp_ns)
-            self.clock_publisher.publish(message)
+            self._port.publish_clock(stamp_ns)
 
     def _account_for_tick(self, now: int) -> None:
         assert self.first_tick_ns is not None

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -82,3 +83,16 @@ def lane_names(lanes: int) -> list[str]:
 def signal_message(frame_id: str) -> JointState:
     """An empty signal to fill and publish again and again."""
     return JointState(header=Header(frame_id=frame_id))
+
+
+def given_message(topic: str, values: Sequence[float], node: Node, joints: Sequence[str] = ()) -> JointState:
+    """What somebody who steers gives on `setpoint`, `disturbance` or `manual_effort`: one value, or one per lane.
+
+    Args:
+        node: whose clock stamps it.
+        joints: which of the joints a setpoint is for; none: all.
+    """
+    message = JointState(name=list(joints))
+    message.header.stamp = node.get_clock().now().to_msg()
+    setattr(message, "position" if topic == "setpoint" else "effort", [float(value) for value in values])
+    return message
