@@ -289,7 +289,7 @@ def test_no_metric_is_hidden_by_the_plants_unit(tmp_path: Path, capsys: pytest.C
 def test_a_turn_goes_the_short_way_and_its_iae_is_that_of_the_sampled_loop(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An integrator under u = 2 e at 100 Hz: e falls by 2 % each sample, along a line; in continuous time, IAE is e0/2."""
+    """An integrator under u = 2 e at 100 Hz: e falls by 2 % each sample, along a line; continuously, IAE is e0/2."""
     path = tmp_path / "yaw.yaml"
     path.write_text(
         "/**:\n  ros__parameters: {sample_period: 0.01}\n"
