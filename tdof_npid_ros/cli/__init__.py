@@ -22,6 +22,7 @@ SUBCOMMANDS = {
     "set": "set parameters or the setpoint of a running loop",
     "get": "parameters and diagnostics of a running loop",
     "reset": "let a running loop's plant begin once more",
+    "commission": "from a running loop to gains: experiment, identify, tune, apply, confirm",
     "experiment": "a step, doublet or relay on a running loop, under its controller's guard",
     "new": "write a commented parameter file for a plant of your own",
     "check": "look at a parameter file as an experienced colleague would",

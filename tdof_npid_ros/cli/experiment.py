@@ -91,11 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def at_rest(loop: LoopAtWork, arguments: argparse.Namespace) -> Rest:
     """The loop at rest, waited for."""
-    return loop.rest(0.01 * _scale(loop), arguments.patience)
-
-
-def _scale(loop: LoopAtWork) -> float:
-    return float(loop.gains.per_lane("sigma")[0])
+    return loop.rest(0.01 * loop.scale, arguments.patience)
 
 
 def proposal_of(loop: LoopAtWork, rest: Rest, arguments: argparse.Namespace, kind: Any, times: float = 1.0) -> Proposal:
@@ -107,7 +103,7 @@ def proposal_of(loop: LoopAtWork, rest: Rest, arguments: argparse.Namespace, kin
         if not given[0] < given[1]:
             raise ValueError(f"--safe-{what} {given[0]:g} {given[1]:g}: the lower end comes first")
         ranges[what] = max(given[0], ends[0]), min(given[1], ends[1])
-    return proposed(rest, by, kind, _scale(loop), ranges["output"], ranges["effort"], arguments.size, times)
+    return proposed(rest, by, kind, loop.scale, ranges["output"], ranges["effort"], arguments.size, times)
 
 
 def told(proposal: Proposal, rest: Rest) -> str:

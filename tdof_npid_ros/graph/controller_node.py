@@ -326,7 +326,7 @@ class ControllerNode(LoopEnd):
         if guard.take(changes, settings, self.controller.integral, now_ns):
             self.session.go_back()
         if had and not guard.name:
-            self.get_logger().warning(one_line(f"experiment {had} has ended, all is as before: {guard.why}"))
+            self.get_logger().warning(one_line(f"experiment {had} has ended ({guard.why}); all else is as before"))
 
     def _is_setpoint_of_now(self, value: Any) -> bool:
         """Whether a value is that of the parameter as it stands, of a dump for one, or the setpoint as commanded."""

@@ -17,7 +17,7 @@ from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, RefusedE
 from tdof_npid_ros.identification.excitation import By, Excitation, Rest, rest_of
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.identification.records import EVEN, Record
-from tdof_npid_ros.parameters import EXPERIMENT
+from tdof_npid_ros.parameters import EXPERIMENT, GAINS
 
 POLL = 0.005  # s
 LEASE = 2.0  # s, of wall time; renewed four times in it
@@ -65,6 +65,14 @@ class LoopAtWork:
     def options(self) -> ControllerOptions:
         """The controller's."""
         return options_from_mapping(self.values)
+
+    @property
+    def scale(self) -> float:
+        """The largest change of the setpoint that is usual; 0: nothing tells it."""
+        gains, (low, high) = self.gains, self.values["safe_range.output"]
+        if gains.type != "pid" or gains.sigma != GAINS["sigma"].default:
+            return float(gains.per_lane("sigma")[0])
+        return 0.1 * (high - low) if math.isfinite(high - low) else 0.0
 
     @property
     def effort_limits(self) -> tuple[float, float]:
@@ -208,6 +216,11 @@ class Hold:
                     return
                 self.move(**{by: excitation.level})
 
+    def renew(self) -> None:
+        """Keep the lease, while nothing else is asked of the loop."""
+        if time.monotonic() > self._renew_at:
+            self._set({})
+
     def wait(self, seconds: float) -> None:
         """Let the loop run for so much of its time."""
         first: float | None = None
@@ -224,8 +237,7 @@ class Hold:
         """
         heard, begun = time.monotonic(), None
         while True:
-            if time.monotonic() > self._renew_at:
-                self._set({})
+            self.renew()
             new, self._seen = self._observer.rows_since(self._seen)
             if not new:
                 if time.monotonic() - heard > SILENCE:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from tdof_npid_ros.identification.fit import Problem, Solution
+from tdof_npid_ros.plants.linear import TransferFunction
 
 CONFIDENCE = 0.95
 POSITIVE = ("time_constant", "time_constant_1", "time_constant_2", "natural_period", "damping")
@@ -70,6 +71,24 @@ def intervals(problem: Problem, solution: Solution) -> dict[str, Interval]:
                 value, max(low, 0.0) if name == "dead_time" else low, value + width * deviation, deviation
             )
     return found
+
+
+def drawn(problem: Problem, solution: Solution, count: int, seed: int = 0) -> list[TransferFunction]:
+    """Plants that the record allows: drawn from the joint distribution that the intervals are of."""
+    structure = problem.structure
+    best = np.concatenate([solution.numerator, solution.point.shape, [solution.point.dead_time]])
+    size, n = len(best), structure.numerators
+    parameters = size + 2 * sum(problem.loaded) + sum(map(len, (*solution.initial, *solution.level)))
+    freedom = max(solution.count - parameters, 1)
+    covariance = _covariance(problem, solution)[:size, :size] * solution.rss / freedom
+    values, vectors = np.linalg.eigh(covariance)
+    spread = vectors * np.sqrt(np.maximum(values, 0.0))
+    random = np.random.default_rng(seed)
+    points = best + random.standard_normal((count, size)) @ spread.T
+    return [
+        structure.transfer_function(point[n : n + structure.shape], max(float(point[-1]), 0.0), point[:n])
+        for point in points
+    ]
 
 
 def _physical(problem: Problem, point: np.ndarray) -> Mapping[str, float]:

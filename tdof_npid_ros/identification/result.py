@@ -34,8 +34,11 @@ def process_of(found: Identified) -> Process:
     )
 
 
-def draft_of(found: Identified, records: Sequence[Record], title: str) -> Draft:
+def draft_of(found: Identified, records: Sequence[Record], title: str, step: float | None = None) -> Draft:
     """A parameter file with the plant, and all else from the record's own scales.
+
+    Args:
+        step: the largest change of the setpoint; None: the record's.
 
     Raises:
         PlantError, TuningError: no file can be made of it.
@@ -59,7 +62,7 @@ def draft_of(found: Identified, records: Sequence[Record], title: str) -> Draft:
         f"{found.fit_percent:.1f} % fit on data not used; noise {found.noise:.3g} (standard deviation).",
         *(f"{name}: {i.value:.5g}, 95 % between {i.low:.5g} and {i.high:.5g}" for name, i in found.parameters.items()),
     ]
-    largest = _largest_step(records)
+    largest = _largest_step(records) if step is None else step
     step = largest
     while True:
         for signed in (step, -step):  # where the actuator is one-sided, only one way may be open

@@ -82,7 +82,7 @@ def test_whatever_stops_an_experiment_all_is_as_before_and_verified(graph: Any, 
         """Begin an experiment, stop it, and wait until all is as before and the loop at rest."""
         graph.wait_until(robot.rests, 60.0, "rest")
         begin(graph, name, kp=4.0, **moves)
-        with graph.expect_log(controller, f"experiment {name} has ended, all is as before: ", 30.0):
+        with graph.expect_log(controller, f"experiment {name} has ended", 30.0):
             stop()
         assert is_as_before(graph)
         line = next(line for line in controller.log.splitlines() if f"experiment {name} has ended" in line)

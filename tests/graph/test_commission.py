@@ -1,0 +1,128 @@
+"""From a running loop to gains, with the tool as a process: near the best there is, with the margin, and never unsafe.
+
+`TDOF_COMMISSION=all` commissions all twenty plants.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commissioned_plants import LOOPS, QUICK, Loop
+
+from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.plants.catalog import named_model
+from tdof_npid_ros.stability.margins import margins
+from tdof_npid_ros.tuning.judge import Constraints
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
+from tdof_npid_ros.tuning.study import Study
+
+HERE = Path(__file__).parent
+MS = 1.8
+CHOSEN = list(LOOPS) if os.environ.get("TDOF_COMMISSION") == "all" else list(QUICK)
+
+
+def started(graph: Any, loop: Loop) -> None:
+    common = {"sample_period": loop.period, "effort_min": loop.effort[0], "effort_max": loop.effort[1]}
+    folder = {"cwd": HERE} if ":" in loop.plant["model"] else {}
+    graph.start(
+        "plant", namespace="/loop", mode="realtime", speed=loop.speed, start=loop.start, effort_timeout=10.0, **common,
+        **loop.plant, **folder,
+    )  # fmt: skip
+    kp, ki = loop.gains
+    graph.start(
+        "controller", namespace="/loop", type="tdof_npid2", kp=kp, ki=ki, sigma=loop.sigma, setpoint=loop.start,
+        output_timeout=5.0, manual=loop.by_hand, manual_effort=resting(loop) if loop.by_hand else 0.0,
+        anti_windup="back_calculation", **{f"safe_range__{k}": list(v) for k, v in ranges(loop).items()}, **common,
+    )  # fmt: skip
+    graph.wait_for_nodes("/loop/plant", "/loop/controller")
+
+
+def ranges(loop: Loop) -> dict[str, tuple[float, float]]:
+    return {"output": loop.safe, "effort": loop.effort}
+
+
+def resting(loop: Loop) -> float:
+    plant = loop.plant
+    if "gain" not in plant:
+        return float(plant.get("effort_offset", 0.0))
+    return float((loop.start - plant.get("output_offset", 0.0)) / plant["gain"] + plant.get("effort_offset", 0.0))
+
+
+def true_case(file: Path, loop: Loop) -> Case:
+    """The episodes and bounds that commissioning has drafted, with the true plant, at rest where it rests."""
+    case = load_case(file)
+    values = {**loop.plant, "effort_min": loop.effort[0], "effort_max": loop.effort[1]}
+    for name in ("noise", "quantum"):
+        values.pop(name, None)
+    return replace(case, model=named_model(loop.plant["model"], HERE), plant_values=values)
+
+
+def compared(case: Case, gains: Gains) -> tuple[float, float, float]:
+    """Objective and M_s of gains on the true plant, and the best objective at the same M_s asked for."""
+    problem = TuningProblem(
+        case, "tdof_npid2", ("sigma",), constraints=Constraints(ms=MS), warm=True, until_converged=True, seed=1
+    )
+    study = Study(replace(problem, case=replace(case, gains=gains)))
+    study.run(Objective(problem))
+    study.require_feasible()
+    value = float(Objective(problem)(candidate_of(problem, gains)).objective[0])
+    found = margins(case, gains)
+    assert found.m_s is not None, found.reason
+    return value, found.m_s, study.result.objective
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", CHOSEN)
+def test_gains_are_near_the_best_with_the_margin_and_the_loop_stays_safe(graph: Any, tmp_path: Path, name: str) -> None:
+    from sensor_msgs.msg import JointState
+
+    loop = LOOPS[name]
+    outputs = graph.collect("/loop/output", JointState)
+    started(graph, loop)
+    tool = subprocess.Popen(
+        [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--json", "--bag", "bag",
+         "--out", "plant.yaml", "--ms", str(MS), *loop.more],
+        env=graph.environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    graph.wait_until(lambda: tool.poll() is not None, 500.0, "the tool's end")
+    told, errors = tool.communicate()
+    assert tool.returncode == 0, told[-1000:] + errors
+    report = json.loads(told)
+    assert report["outcome"] == "kept" and report["experiments"] <= 3
+    assert (tmp_path / "bag" / "commission.html").stat().st_size > 10_000
+    on_controller = graph.get_parameters("/loop/controller", "kp", "ki", "sigma", "manual", "experiment")
+    new = report["gains"]
+    assert on_controller == [new["kp"], new["ki"], new["sigma"], loop.by_hand, ""]
+    low, high = loop.safe
+    assert all(low <= message.position[0] <= high for message in outputs)
+    case = true_case(tmp_path / "plant.yaml", loop)
+    value, m_s, best = compared(case, case.gains.with_values(**new))
+    structure, experiments = report["model"]["structure"], report["experiments"]
+    with Path(os.environ.get("TDOF_COMMISSION_TABLE", os.devnull)).open("a") as file:
+        file.write(f"| {name} | {structure} | {experiments} | {value / best:.3f} | {m_s:.3f} |\n")
+    assert value <= 1.15 * best and m_s <= 2.0
+
+
+def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path) -> None:
+    loop = LOOPS["lag dominant"]
+    started(graph, loop)
+    tool = subprocess.Popen(
+        [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag"],
+        env=graph.environment, cwd=tmp_path,
+    )  # fmt: skip
+    graph.wait_until(lambda: graph.get_parameters("/loop/controller", "experiment") != [""], 60.0, "the experiment")
+    tool.send_signal(signal.SIGINT)
+    graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
+    assert tool.returncode == 130
+    found = graph.get_parameters("/loop/controller", "experiment", "kp", "ki", "manual", "setpoint")
+    assert found == ["", *loop.gains, False, loop.start]
