@@ -23,6 +23,7 @@ ALL_STRUCTURES = 50_000  # samples; of longer records not every structure is fit
 FEW_STRUCTURES = 2  # … but so many
 FULL_ITERATIONS = 12
 ARITHMETIC = 100.0  # of the smallest sum of squares: what the intervals count as noise at the least
+ROUNDING = 1e-6  # of the effort's range: a smaller load step is the arithmetic's, which a record without noise shows
 STEADY = 0.05  # of the effort's range: less is no move
 LONGEST_START = 0.25  # of a stretch: more is not left out
 FOLDS = 2
@@ -135,7 +136,7 @@ def identify(stretches: Sequence[Stretch], structures: Sequence[Structure] = tup
         [
             LoadStep(i, float(solution.point.load_time[i]) - solution.point.dead_time, float(solution.point.load[i]))
             for i, there in enumerate(final.problem.loaded)
-            if there
+            if there and abs(float(solution.point.load[i])) > ROUNDING * float(np.ptp(stretches[i].effort))
         ],
         _held_out_fit(final.problem, solution),
         math.sqrt(float(np.mean(np.concatenate([r[s.used] for r, s in zip(residuals, stretches, strict=True)]) ** 2))),

@@ -47,7 +47,7 @@ def marked_blocks() -> dict[str, list[str]]:
     return found
 
 
-OVER_ROS = ("run", "analyze", "verify", "live")
+OVER_ROS = ("run", "analyze", "verify", "live", "commission")  # what tests/graph runs
 
 
 @pytest.mark.parametrize("name", marked_blocks())

@@ -78,8 +78,8 @@ LOOPS = {
                   (-12.0, 12.0)),
     "integrator": Loop(transfer([0.05], [1.0, 0.0], 4.0, noise=0.005), (1.0, 0.01), 0.0, (-3.0, 3.0), 1.0),
     "level by hand": Loop(
-        transfer([0.002], [1.0, 0.0], 2.0, noise=0.002, effort_offset=40.0), (20.0, 0.2), 1.0, (0.2, 2.5), 0.5, PER_CENT,
-        by_hand=True,
+        transfer([0.002], [1.0, 0.0], 2.0, noise=0.002, effort_offset=40.0), (20.0, 0.2), 1.0, (0.2, 2.5), 0.5,
+        PER_CENT, by_hand=True,
     ),
     "tank": Loop({"model": "commissioned_plants:Tank", "noise": 0.002}, (40.0, 2.0), 1.0, (0.4, 1.8), 0.2, PER_CENT),
     "inverse response": Loop(
