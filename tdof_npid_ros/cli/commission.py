@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from tdof_npid_ros.cli.experiment import add_experiment_arguments, at_rest, proposal_of, recorded, told
 from tdof_npid_ros.cli.loop_client import observed
 from tdof_npid_ros.commissioning.confirm import Confirmed, confirmed, settling_time
-from tdof_npid_ros.commissioning.design import Design, designed
+from tdof_npid_ros.commissioning.design import Design, check_relay, designed
 from tdof_npid_ros.commissioning.report import Commissioning, lines_of
 from tdof_npid_ros.control.gains import controller_type
 from tdof_npid_ros.identification import IdentificationError
@@ -86,7 +86,11 @@ def _commission(
         try:
             found = identify([record.stretch for record in work.records])
             period = float(loop.values["sample_period"])
-            design = designed(found, work.records, loop.gains, controller, period, arguments.ms, loop.scale or None)
+            if arguments.kind == "relay":
+                check_relay(found, work.records[-1])
+            design = designed(
+                found, work.records, loop.gains, loop.options, controller, period, arguments.ms, loop.scale or None
+            )
         except (IdentificationError, PlantError, TuningError) as error:
             last = error
             say(f"not yet: {error}")

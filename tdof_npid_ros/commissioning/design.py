@@ -11,8 +11,10 @@ import numpy as np
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import ControllerType, Gains
+from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.draft import Draft
 from tdof_npid_ros.identification import IdentificationError
+from tdof_npid_ros.identification.excitation import relay_point
 from tdof_npid_ros.identification.identify import Identified
 from tdof_npid_ros.identification.intervals import drawn
 from tdof_npid_ros.identification.records import Record
@@ -27,6 +29,7 @@ from tdof_npid_ros.tuning.study import Study
 
 DRAWN = 40  # plants
 ALLOWED = 1.1  # times M_s - 1 asked for: what the worst of the plants drawn may have
+RELAY_AGREES = 1.3  # factor between the gain that a relay tells and the model's
 TIGHTENED = 4  # times that the margin asked of the model is tightened until that holds
 SET = ("type", "kp", "ki", "kd", "alpha", "beta", "sigma")
 
@@ -38,7 +41,7 @@ class Design:
     Attributes:
         found: the plant.
         draft: its parameter file.
-        case: the plant with its episodes; its gains are the present ones.
+        case: the plant with its episodes; its gains are the present ones, its options the controller's.
         gains: the new ones.
         objective, objective_before: of the new and of the present gains.
         margins, margins_before: of the model's loop.
@@ -73,6 +76,7 @@ def designed(
     found: Identified,
     records: Sequence[Record],
     present: Gains,
+    options: ControllerOptions,
     controller: ControllerType,
     sample_period: float,
     ms: float,
@@ -82,7 +86,8 @@ def designed(
     """Gains for a plant that was identified.
 
     Args:
-        present: the controller's; all that is not tuned stays as there.
+        present, options: the controller's; all that is not tuned stays as there. Options are left out of the tuning,
+            but not of the margins and responses.
         controller: the type to tune.
         sample_period: the controller's, s.
         ms: largest M_s.
@@ -94,6 +99,7 @@ def designed(
     """
     draft = replace(draft_of(found, records, "Commissioned", step), sample_period=sample_period, ms=ms)
     case = case_of(draft, present)
+    operated = replace(case, options=replace(options, manual=False, manual_effort=0.0))
     plants = drawn(found.problem, found.solution, DRAWN, seed)
     limit, worst = 1.0 + ALLOWED * (ms - 1.0), np.inf
     asked = ms
@@ -111,19 +117,39 @@ def designed(
         study.run(Objective(problem))
         study.require_feasible()
         gains = study.result.gains
-        worst = max(m_s_of(case, plant, gains) for plant in plants)
+        worst = max(m_s_of(operated, plant, gains) for plant in plants)
         if worst <= limit:
             before, as_before = case.gains, replace(problem, controller=case.gains.type, extra=())
             values = Objective(as_before)(candidate_of(as_before, before)).objective
             return Design(
-                found, draft, case, gains, study.result.objective, float(values[0]),
-                margins(case, gains), margins(case, before), worst, asked,
+                found, draft, operated, gains, study.result.objective, float(values[0]),
+                margins(operated, gains), margins(operated, before), worst, asked,
             )  # fmt: skip
         asked = 1.0 + (asked - 1.0) * max(min((limit - 1.0) / (worst - 1.0), 0.95), 0.5)
     raise IdentificationError(
         f"the plant is not known well enough: of {DRAWN} plants that the record allows, the worst has M_s {worst:.3g} "
         f"with the gains found, more than {limit:.3g}; make a larger experiment (--size), or a second one"
     )
+
+
+def check_relay(found: Identified, record: Record) -> None:
+    """Make sure that the model goes through the point that a relay's oscillation tells, if it tells one.
+
+    Raises:
+        IdentificationError: it does not.
+    """
+    stretch, point, shape = record.stretch, found.solution.point, found.solution.numerator
+    told = relay_point(stretch.time, stretch.effort, stretch.output)
+    if told is None:
+        return
+    plant = found.structure.transfer_function(point.shape, point.dead_time, shape)
+    s = 2j * np.pi / told.period
+    gain = abs(complex(np.polyval(plant.numerator, s) / np.polyval(plant.denominator, s)))
+    if not 1.0 / RELAY_AGREES <= told.gain / gain <= RELAY_AGREES:
+        raise IdentificationError(
+            f"the relay's oscillation of {told.period:.4g} s tells a gain of {told.gain:.4g}, the model {gain:.4g}: "
+            "the plant is not linear there; make a smaller experiment"
+        )
 
 
 def case_of(draft: Draft, present: Gains) -> Case:

@@ -92,8 +92,12 @@ class Commissioning:
             predicted = Curve("model", stretch.time, stretch.output - residual, stretch.effort)
             measured = Curve("measured", stretch.time, stretch.output, stretch.effort, record.setpoint)
             page.plot(*response_plots(Panel(record.name, [measured, predicted])))
-        page.heading("The plant")
-        for line in table(design.found).splitlines():
+        page.heading(f"The plant: {design.found.structure.text}")
+        page.text(design.found.reason)
+        intervals = design.found.parameters.items()
+        bounds = [(name, *map(_text, (one.value, one.low, one.high))) for name, one in intervals]
+        page.table([("parameter", "value", "95 % from", "to"), *bounds])
+        for line in table(design.found).splitlines()[len(bounds) + 2 :]:
             page.text(line.strip())
         page.heading("Gains and margins")
         page.table(_compared(design))

@@ -95,7 +95,7 @@ class Guard:
         if name and self.name and name != self.name:
             raise ValueError(f"experiment {self.name} has the loop: wait for its end, or end it: set experiment to ''")
         if name and name == self.ended:
-            raise ValueError(f"experiment {name} has ended: {self.why}; give another one another name")
+            raise ValueError(f"experiment {name} has ended: {self.why}; the next one needs another name")
         for kind, moved in (("output", "experiment_setpoint"), ("effort", "experiment_effort")):
             value, (low, high) = settings[moved], settings[f"safe_range.{kind}"]
             if value == NOT_MOVED:
