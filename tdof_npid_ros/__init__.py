@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tdof_npid_ros.control.options import ControllerOptions as ControllerOptions
     from tdof_npid_ros.graph.running import run as run
     from tdof_npid_ros.interface import read_bag as read_bag
+    from tdof_npid_ros.interface import robust as robust
     from tdof_npid_ros.interface import simulate as simulate
     from tdof_npid_ros.interface import sweep as sweep
     from tdof_npid_ros.interface import tune as tune
@@ -43,6 +44,7 @@ _HOMES = {
     "make_case": "case",
     "margins": "stability.margins",
     "read_bag": "interface",
+    "robust": "interface",
     "run": "graph.running",
     "simulate": "interface",
     "sweep": "interface",

@@ -14,7 +14,10 @@ from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import PER_LANE, ControllerType, Gains, GainsError
 from tdof_npid_ros.loop import Trajectory
+from tdof_npid_ros.robustness.result import RobustResult, sweep_plants
+from tdof_npid_ros.robustness.spread import Sampling, spreads_of
 from tdof_npid_ros.tuning.study import TuningResult, tune_case
+from tdof_npid_ros.workers import workers
 
 
 def simulate(case: Case, episode: str, gains: Gains | None = None) -> Trajectory:
@@ -104,6 +107,46 @@ def tune(
     if weight is not None:
         case = replace(case, weight=weight)
     return tune_case(case, controller or case.gains.type, seed=seed, **options)
+
+
+def robust(
+    case: Case,
+    spreads: Sequence[str],
+    *,
+    gains: Gains | None = None,
+    samples: int = 10_000,
+    sampling: Sampling = "uniform",
+    seed: int = 0,
+    scheduler: str | None = None,
+) -> RobustResult:
+    """What gains achieve on many plants near a case's: how many are unstable, quantiles, sensitivities, the worst.
+
+    Args:
+        case: with the episodes `setpoint` and `disturbance`.
+        spreads: of the plant's parameters: `gain 20 %` (of the value), `gain 0.1` (in its unit, both ways), or
+            `gain 0.8 .. 1.3`.
+        gains: of one lane; None: the case's.
+        samples: how many plants.
+        sampling: uniform, latin, normal or corners.
+        seed: the same seed gives the same plants.
+        scheduler: of a Dask cluster, address or file; None: threads on all cores. The result is the same.
+
+    Returns:
+        `unstable`, (plants,), `values`, (plants, spreads), `metrics`, (plants,) each by name; `unstable_fraction`,
+        `quantile(metric, fraction)`, `sensitivity(metric)`, `worst()`, `as_dict()`.
+
+    Raises:
+        RobustError, PlantError: a spread is none, or reaches a plant that cannot be.
+
+    Example:
+        >>> from tdof_npid_ros import load_case, robust
+        >>> result = robust(load_case("p3-c1"), ["gain 30 %", "time_constant 20 %"], samples=64, sampling="latin")
+        >>> result.unstable_fraction
+        0.125
+    """
+    its = spreads_of(case, spreads, sampling)
+    with workers(scheduler) as here:
+        return sweep_plants(here, case, gains or case.gains, its, count=samples, sampling=sampling, seed=seed)
 
 
 class Bag:

@@ -161,8 +161,9 @@ def _lanes_of(plants: Plants, gains: Gains) -> int:
     """
     if not isinstance(plants, LanePlants):
         return gains.lanes
-    if gains.lanes not in (1, plants.lanes):
-        raise GainsError(f"gains for {gains.lanes} lanes, but plants for {plants.lanes}: give one, or one per lane")
+    if gains.lanes > 1 and gains.lanes != 1 + plants.gains.max(initial=0):
+        wanted = 1 + plants.gains.max(initial=0)
+        raise GainsError(f"gains for {gains.lanes} lanes, but plants for {wanted}: give one, or one per lane")
     return plants.lanes
 
 
@@ -177,13 +178,15 @@ def _run(
     steps, lanes = signals.steps, _lanes_of(plants, gains)
     c = coefficients(gains, signals.sample_period_ns / 1e9)
     iae, finite, early, late, largest = np.zeros((5, lanes))
-    for block in _blocks(gains, lanes):
-        bounds = limits_of(gains, min(block.start, gains.lanes - 1)), conditional_integration(gains), limits
+    own = plants.gains if isinstance(plants, LanePlants) else np.arange(lanes)
+    of_gains = np.minimum(own, gains.lanes - 1)
+    for block in _blocks(gains, of_gains):
+        bounds = limits_of(gains, int(of_gains[block.start])), conditional_integration(gains), limits
         width = _width(block.stop - block.start, isinstance(plants, LanePlants))
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
         of_block = np.minimum(np.arange(block.start, block.start + width), block.stop - 1)
         its = plants[of_block] if isinstance(plants, LanePlants) else plants
-        c_block = np.ascontiguousarray(c[:, np.minimum(of_block, gains.lanes - 1)])
+        c_block = np.ascontiguousarray(c[:, of_gains[of_block]])
         lane_rows, sums = _run_block_of(its, gains, c_block, bounds, signals, y, u)
         iae[block], finite[block] = lane_rows[_ERROR_SUM : _FINITE + 1, : block.stop - block.start]
         if signals.rest is not None:
@@ -196,11 +199,11 @@ def _run(
     return Integrals(iae * h, finite / (steps + 1), early * h, late * h, largest)
 
 
-def _blocks(gains: Gains, lanes: int) -> Iterator[slice]:
-    """Lanes that run at once: neighbours with the same limits."""
-    low, high = (gains.per_lane(name) for name in LIMITS_PER_LANE)
+def _blocks(gains: Gains, of_gains: np.ndarray) -> Iterator[slice]:
+    """Lanes that run at once: neighbours with the same limits; `of_gains`: which gains each has, (lanes,)."""
+    low, high = (gains.per_lane(name)[of_gains] for name in LIMITS_PER_LANE)
     changes = 1 + np.flatnonzero((low[1:] != low[:-1]) | (high[1:] != high[:-1]))
-    for begin, end in pairwise([0, *changes.tolist(), lanes]):
+    for begin, end in pairwise([0, *changes.tolist(), len(of_gains)]):
         for first in range(begin, end, LARGEST_BLOCK):
             yield slice(first, min(first + LARGEST_BLOCK, end))
 

@@ -20,6 +20,7 @@ import numpy as np
 from tdof_npid_ros.advice import USUAL_M_S
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import INTERRUPTED
+from tdof_npid_ros.cli.robust import add_spread_argument
 from tdof_npid_ros.cli.simulate import (
     add_output_arguments,
     advised,
@@ -33,13 +34,19 @@ from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import check_replaceable, find_parameter_file, write_parameters
 from tdof_npid_ros.parameters import TUNER
+from tdof_npid_ros.robustness.result import RobustResult, finite, sweep_plants
+from tdof_npid_ros.robustness.spread import spreads_of
 from tdof_npid_ros.stability.margins import Margins, margins
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
+from tdof_npid_ros.tuning.perturbed import Perturbed
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study
+from tdof_npid_ros.workers import workers
+
+UNSEEN = 10_000  # other plants, for which robust gains are verified
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,10 +78,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cold", action="store_true", help="do not begin with the case's own gains")
     add_constraint_arguments(parser)
+    _add_robust_arguments(parser)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="saved after each generation")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the gains as a ROS parameter file")
     add_output_arguments(parser)
+
+
+def _add_robust_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("many plants at once")
+    group.add_argument("--robust", type=int, metavar="N", help="tune for N plants near the case's (usual: 50)")
+    add_spread_argument(group)
+    group.add_argument(
+        "--robust-by",
+        default="mean",
+        metavar="mean|worst|Q",
+        help="what is minimised over the plants: the mean (default), the worst, or a quantile, as 0.9",
+    )
 
 
 def add_constraint_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,11 +137,48 @@ def run(arguments: argparse.Namespace) -> int:
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
     report |= _search_report(study) | {"margins": found.as_dict()}
     report |= advised(problem.case, result.gains)
+    unseen = _unseen(problem, result.gains)
+    if unseen is not None:
+        report |= {"robust": _robust_report(problem, result.objective, unseen)}
     if arguments.out:
         write_parameters(arguments.out, {"controller": result.gains.as_dict()})
     write_responses(problem.case, _compared(problem, result.gains), arguments)
-    print(json.dumps(report) if arguments.json else _summary(report, found))
+    lines = [_summary(report, found), *(_robust_lines(report["robust"], unseen) if unseen is not None else [])]
+    print(json.dumps(report) if arguments.json else "\n".join(lines))
     return 0
+
+
+def _unseen(problem: TuningProblem, gains: Gains) -> RobustResult | None:
+    """What the gains achieve on other plants of the spreads than they were tuned for."""
+    if problem.perturbed is None:
+        return None
+    with workers() as here:
+        seed = problem.perturbed.seed + 1
+        return sweep_plants(here, problem.case, gains, problem.perturbed.spreads, count=UNSEEN, seed=seed)
+
+
+def _robust_report(problem: TuningProblem, objective: float, unseen: RobustResult) -> dict[str, Any]:
+    """The number that was minimised, over the plants that were tuned for, and the same over the others."""
+    perturbed = problem.perturbed
+    assert perturbed is not None
+    others = float(perturbed.together(unseen.metrics["objective"][:, None])[0])
+    return {
+        "by": perturbed.by,
+        "plants": perturbed.plants,
+        "objective": objective,
+        "unseen_objective": finite(others),
+        "unseen": unseen.as_dict(),
+    }
+
+
+def _robust_lines(robust: dict[str, Any], unseen: RobustResult) -> list[str]:
+    by = f"quantile {robust['by']:g}" if isinstance(robust["by"], float) else robust["by"]
+    others = robust["unseen_objective"]
+    told = "none, for some are unstable" if others is None else in_units(others)
+    return [
+        f"  objective over the {robust['plants']} plants tuned for, {by}: {in_units(robust['objective'])}",
+        f"  over {len(unseen.unstable)} others: {told}; {unseen.unstable_line()}",
+    ]
 
 
 def _search_report(study: Study) -> dict[str, Any]:
@@ -148,6 +205,7 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         if arguments.budget < arguments.population:
             raise TuningError(f"a budget of {arguments.budget} is less than one population of {arguments.population}")
         generations = arguments.budget // max(arguments.population, 1)
+    perturbed = _perturbed(case, arguments)
     free = arguments.free or (case.search.get("free") if controller != "pid" else None)
     extra = (free,) if free else ()
     return TuningProblem(
@@ -163,7 +221,27 @@ def _problem(arguments: argparse.Namespace) -> TuningProblem:
         constraints_of(arguments, case),
         warm=not arguments.cold,
         until_converged=arguments.until_converged,
+        perturbed=perturbed,
     )
+
+
+def _perturbed(case: Case, arguments: argparse.Namespace) -> Perturbed | None:
+    """The plants to tune for at once.
+
+    Raises:
+        TuningError, RobustError: some but not all is given, or there are no such plants.
+    """
+    if arguments.robust is None:
+        if arguments.spread or arguments.robust_by != "mean":
+            raise TuningError("--spread and --robust-by are of the plants that --robust N tunes for: give it too")
+        return None
+    by: str | float = arguments.robust_by
+    if by not in ("mean", "worst"):
+        try:
+            by = float(by)
+        except ValueError:
+            raise TuningError(f"--robust-by {by}: take mean, worst, or a quantile as a fraction, 0.9") from None
+    return Perturbed(spreads_of(case, arguments.spread), arguments.robust, by)
 
 
 def _check_episodes(problem: TuningProblem) -> None:

@@ -70,6 +70,7 @@ class LanePlants:
         effort: that was on before, (lanes,).
         measured: the first output, (lanes,).
         segments: by the plan's segments' first steps.
+        gains: which lane of the gains each has, (lanes,).
     """
 
     like: tuple[float, ...]
@@ -77,6 +78,7 @@ class LanePlants:
     effort: np.ndarray
     measured: np.ndarray
     segments: dict[int, Segment]
+    gains: np.ndarray
 
     @property
     def lanes(self) -> int:
@@ -95,7 +97,13 @@ class LanePlants:
             effort=self.effort[lanes],
             measured=self.measured[lanes],
             segments=segments,
+            gains=self.gains[lanes],
         )
+
+    def with_each_of(self, gains: int) -> LanePlants:
+        """These plants with each of so many lanes of gains: first all plants with the first gains, and so on."""
+        lanes = self[np.tile(np.arange(self.lanes), gains)]
+        return replace(lanes, gains=np.repeat(np.arange(gains), self.lanes))
 
     def own_rows(self) -> int:
         """How many rows a lane has behind its state."""
@@ -142,6 +150,7 @@ def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: 
         np.array([plant.initial_effort for plant in begun]),
         np.array([first_measured(plant) for plant in begun]),
         segments,
+        np.arange(len(plants)),
     )
 
 

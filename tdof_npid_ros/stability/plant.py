@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +13,9 @@ from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import ALPHA, KP, coefficients
 from tdof_npid_ros.plants.kernels import SampledLinear, SampledOffset
-from tdof_npid_ros.plants.linear import TransferFunction
+from tdof_npid_ros.plants.linear import TransferFunction, sampled_lanes
 from tdof_npid_ros.plants.linearise import has_kink, linearised
+from tdof_npid_ros.plants.noise import noiseless
 from tdof_npid_ros.plants.ode import Ode, Sprott
 from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.stability import StabilityError
@@ -83,10 +86,8 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
     """
     plant, h = case.plant, case.sample_period
     sampled = plant.sampled(case.sample_period_ns)
-    if isinstance(sampled, SampledOffset):
-        sampled = SampledLinear(*sampled[:4])  # of deviations from its operating point
-    if isinstance(sampled, SampledLinear):
-        return pulse_transfer(sampled, h).filtered(case.options.filter_time)
+    if isinstance(sampled, SampledLinear | SampledOffset):
+        return _linear(case, sampled)
     assert isinstance(plant, (Ode, Sprott))
     point = point or operating_point(case, case.gains.with_values(ki=1.0, kp=1.0, kd=0.0))
     assert point.output is not None
@@ -101,6 +102,19 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
     phi, gamma = _runge_kutta(a, b, h / substeps, substeps)
     linear = SampledLinear(tuple(map(tuple, phi.tolist())), (0.0,) * len(c), tuple(gamma.tolist()), 0)
     return pulse_transfer(linear, h, c.tolist()).filtered(case.options.filter_time)
+
+
+def linear_loop_plants(case: Case, changes: Sequence[Mapping[str, Any]]) -> list[PulseTransfer]:
+    """`loop_plant` of a case with a linear plant, for each set of changed parameters."""
+    plants = [noiseless(case.plant_at(changed)) for changed in changes]
+    linear = [plant for plant in plants if isinstance(plant, TransferFunction)]
+    assert len(linear) == len(plants)
+    return [_linear(case, sampled) for sampled in sampled_lanes(linear, case.sample_period_ns)]
+
+
+def _linear(case: Case, sampled: SampledLinear | SampledOffset) -> PulseTransfer:
+    """The sampled plant, of deviations from its operating point, and the controller's filter behind it."""
+    return pulse_transfer(SampledLinear(*sampled[:4]), case.sample_period).filtered(case.options.filter_time)
 
 
 def _usual(case: Case) -> tuple[float, float]:

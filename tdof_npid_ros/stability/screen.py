@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -116,20 +117,48 @@ class Screen:
         c = coefficients(gains, self.plant.sample_period)
         found = np.empty((_RESULTS, gains.lanes))
         _screen_lanes(self._response, c[KP], c[KI_H], c[KD_H], c[PHI], modes, found)
-        stable = found[_STABLE] > 0.0
-        h = self.plant.sample_period
-        with np.errstate(divide="ignore"):
-            time_constant = -h / np.log(np.minimum(found[_RADIUS], 1.0))
-        return LaneMargins(
-            stable,
-            found[_MS],
-            found[_MT],
-            found[_GAIN],
-            found[_GAIN_LOW],
-            found[_PHASE],
-            found[_DELAY] * h,
-            np.where(stable, time_constant, np.nan),
-        )
+        return _lane_margins(found, self.plant.sample_period)
+
+
+class Screens:
+    """Margins of any number of candidates with each of several linear plants.
+
+    Args:
+        plants: as for `Screen`, of one sample period.
+
+    Raises:
+        StabilityError: see `Screen`.
+    """
+
+    def __init__(self, plants: Sequence[PulseTransfer]) -> None:
+        self._sample_period = plants[0].sample_period
+        self._responses = [_response(plant) for plant in plants]
+
+    def __call__(self, gains: Gains, modes: bool = True) -> LaneMargins:
+        """The margins, (lanes * plants,): first of the first lane with all plants, and so on; else as `Screen`."""
+        c = coefficients(gains, self._sample_period)
+        found = np.empty((len(self._responses), _RESULTS, gains.lanes))
+        for response, of_plant in zip(self._responses, found, strict=True):
+            _screen_lanes(response, c[KP], c[KI_H], c[KD_H], c[PHI], modes, of_plant)
+        by_lane = np.ascontiguousarray(found.transpose(1, 2, 0)).reshape(_RESULTS, -1)
+        return _lane_margins(by_lane, self._sample_period)
+
+
+def _lane_margins(found: np.ndarray, h: float) -> LaneMargins:
+    """From the rows of the result, (_RESULTS, lanes)."""
+    stable = found[_STABLE] > 0.0
+    with np.errstate(divide="ignore"):
+        time_constant = -h / np.log(np.minimum(found[_RADIUS], 1.0))
+    return LaneMargins(
+        stable,
+        found[_MS],
+        found[_MT],
+        found[_GAIN],
+        found[_GAIN_LOW],
+        found[_PHASE],
+        found[_DELAY] * h,
+        np.where(stable, time_constant, np.nan),
+    )
 
 
 def frequency_grid(plant: PulseTransfer) -> np.ndarray:

@@ -137,8 +137,14 @@ class Judge:
             setpoint, disturbance: of their episodes, (n,) each.
         """
         margins = self._screen(gains) if self._screen else None
+        return self.scores(gains.per_lane("ki"), margins, objective, setpoint, disturbance)
+
+    def scores(
+        self, ki: Array, margins: LaneMargins | None, objective: Array, setpoint: Integrals, disturbance: Integrals
+    ) -> Scores:
+        """As `__call__`, with the margins known; ki: the candidates', (n,)."""
         tails = [
-            tail(self._without_noise(episode), length, gains, margins)
+            tail(self._without_noise(episode), length, ki, margins)
             for episode, length in zip((setpoint, disturbance), self._lengths, strict=True)
         ]
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -157,7 +163,7 @@ class Judge:
         return replace(episode, rest_error=np.maximum(episode.rest_error - self._noise_bound, 0.0))
 
 
-def tail(episode: Integrals, length: float, gains: Gains, margins: LaneMargins | None) -> Array:
+def tail(episode: Integrals, length: float, ki: Array, margins: LaneMargins | None) -> Array:
     """A bound of the IAE that would come after an episode of `length` s, (lanes,); 0 for a length of 0."""
     error, late, early = episode.rest_error, episode.late_rest_iae, episode.early_rest_iae
     if length == 0.0:
@@ -168,5 +174,5 @@ def tail(episode: Integrals, length: float, gains: Gains, margins: LaneMargins |
             left = np.where(late < early, late * late / (early - late), error * for_ever)  # a geometric series
             return np.minimum(left, error * for_ever)
         slowest = margins.time_constant
-        decays = (gains.per_lane("ki") != 0.0) & (late <= DECAYING * error * slowest)
+        decays = (ki != 0.0) & (late <= DECAYING * error * slowest)
         return error * np.where(decays, slowest, np.fmax(slowest, for_ever))

@@ -7,11 +7,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 
 from tdof_npid_ros.control.gains import gains_from_candidates
 from tdof_npid_ros.loop import VECTOR, Integrals, joined
+from tdof_npid_ros.plants.per_lane import LanePlants
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
 from tdof_npid_ros.workers import available_cores
@@ -36,8 +38,14 @@ def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float)
 
 
 def scores(problem: TuningProblem, candidates: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
-    """The scores of candidates (n, len(problem.names)) from the integrals of their episodes, (n,) each."""
+    """The scores of candidates (n, len(problem.names)) from the integrals of their episodes, (n,) each.
+
+    With perturbed plants the integrals are (n * plants,): first those of the first candidate with all plants.
+    """
     gains = gains_from_candidates(problem.base, problem.names, candidates)
+    if problem.perturbed:
+        values = objective_values(setpoint, disturbance, problem.weight)
+        return problem.plants_judge(gains, values, setpoint, disturbance)
     return problem.judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
 
 
@@ -79,7 +87,9 @@ class Objective:
         return scores(self._problem, candidates, *self.integrals(candidates))
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
-        """Of the setpoint and the disturbance episode, (n,) each."""
+        """Of the setpoint and the disturbance episode, (n,) each; (n * plants,) with perturbed plants."""
+        if self._problem.perturbed:
+            return self._integrals_of_plants(candidates)
         problem = self._problem
         blocks = [
             gains_from_candidates(problem.base, problem.names, candidates[block])
@@ -88,6 +98,28 @@ class Objective:
         running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
         setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance
+
+    def _integrals_of_plants(self, candidates: Array) -> tuple[Integrals, Integrals]:
+        problem = self._problem
+        parts = np.array_split(candidates, min(self._threads, len(candidates)))
+
+        plants_of = self._plants  # before threads ask for them
+
+        def run(episode: str, part: Array) -> Integrals:
+            plants = plants_of[episode].with_each_of(len(part))
+            return problem.case.integrals(episode, gains_from_candidates(problem.base, problem.names, part), plants)
+
+        running = [[self._pool.submit(run, episode, part) for part in parts] for episode in EPISODES]
+        setpoint, disturbance = (joined([part.result() for part in episode]) for episode in running)
+        return setpoint, disturbance
+
+    @cached_property
+    def _plants(self) -> dict[str, LanePlants]:
+        """The perturbed plants, by episode."""
+        problem = self._problem
+        assert problem.perturbed is not None
+        changes = problem.perturbed.changes(problem.case)
+        return {episode: problem.case.lane_plants(episode, changes) for episode in EPISODES}
 
 
 def _blocks(lanes: int, threads: int) -> list[slice]:

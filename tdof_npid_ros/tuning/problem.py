@@ -19,6 +19,7 @@ from tdof_npid_ros.stability.screen import Screen
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.judge import DIVERGED, LARGEST_TAIL, UNSTABLE, Constraints, Judge
+from tdof_npid_ros.tuning.perturbed import Perturbed, PlantsJudge
 from tdof_npid_ros.tuning.space import Space
 
 EPISODES = ("setpoint", "disturbance")
@@ -56,6 +57,7 @@ class TuningProblem:
         constraints: margins that the loop must have.
         warm: whether the case's own gains are among the first candidates.
         until_converged: whether the search ends when it has converged, before its budget is spent.
+        perturbed: plants near the case's, for all of which the gains are tuned at once; None: for the case's alone.
 
     Raises:
         TuningError: the case lacks an episode or bounds, its bounds allow gains that no controller takes, or margins
@@ -74,6 +76,7 @@ class TuningProblem:
     constraints: Constraints = field(default_factory=Constraints)
     warm: bool = False
     until_converged: bool = False
+    perturbed: Perturbed | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -198,6 +201,12 @@ class TuningProblem:
         return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight, self.case.noise_bound)
 
     @cached_property
+    def plants_judge(self) -> PlantsJudge:
+        """Of which candidates may win with all perturbed plants."""
+        assert self.perturbed is not None
+        return PlantsJudge(self.perturbed, self.case, self.judge, linear=self.screen is not None)
+
+    @cached_property
     def restless(self) -> dict[str, str]:
         """The episodes in which no loop comes to rest, because that takes an effort beyond the limits: the reason."""
         case, reasons = self.case, {}
@@ -219,6 +228,8 @@ class TuningProblem:
     def shortfall(self, gains: Gains, violation: float) -> str:
         """Why nothing was allowed, from the gains that came nearest and their violation."""
         within = f"{self.case.name}: within the bounds of the search"
+        if self.perturbed:
+            within += f", for all {self.perturbed.plants} plants and the corners of their spreads,"
         if violation >= DIVERGED:
             return f"{within} every {self.controller} that was tried diverges"
         if violation >= UNSTABLE:
@@ -267,6 +278,7 @@ class TuningProblem:
             **{f"constraint.{name}": value for name, value in self.constraints.given.items()},
             "starts": self.starts.tolist(),
             "until_converged": self.until_converged,
+            **(self.perturbed.description() if self.perturbed else {}),
         }
 
 

@@ -24,6 +24,7 @@ from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import make_optimizer, restore_optimizer
+from tdof_npid_ros.tuning.perturbed import Perturbed
 from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
 
 
@@ -221,6 +222,7 @@ def tune_case(
     generations: int = GENERATIONS,
     constraints: Constraints | None = None,
     threads: int | None = None,
+    perturbed: Perturbed | None = None,
 ) -> TuningResult:
     """Tune one controller type on a case, in process, with the case's bounds and weight, from random gains.
 
@@ -228,6 +230,7 @@ def tune_case(
         extra: `("sigma",)` to free sigma too.
         constraints: margins that the loop must have; whether it has them, `feasible` says.
         threads: by default one per core; the result does not depend on it.
+        perturbed: plants near the case's, to tune for all of them at once.
 
     Raises:
         TuningError: see `TuningProblem`.
@@ -242,6 +245,7 @@ def tune_case(
         population,
         generations,
         constraints=constraints or Constraints(),
+        perturbed=perturbed,
     )
     study = Study(problem)
     study.run(Objective(problem, threads))

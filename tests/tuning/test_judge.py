@@ -59,9 +59,9 @@ def rest(early: float, late: float, error: float, iae: float = 1.0) -> Integrals
 
 def test_without_a_model_the_outputs_alone_tell_how_the_error_decays() -> None:
     gains = load_case("p3-c1").gains
-    assert tail(rest(0.2, 0.1, 0.2), 10.0, gains, None)[0] == pytest.approx(0.1)  # 0.1, 0.05, 0.025, …
-    assert tail(rest(0.1, 0.1, 0.02), 10.0, gains, None)[0] == pytest.approx(9 * 10.0 * 0.02)  # it stays
-    assert tail(rest(0.0, 0.0, 0.0), 10.0, gains, None)[0] == 0.0
+    assert tail(rest(0.2, 0.1, 0.2), 10.0, gains.per_lane("ki"), None)[0] == pytest.approx(0.1)  # 0.1, 0.05, 0.025, …
+    assert tail(rest(0.1, 0.1, 0.02), 10.0, gains.per_lane("ki"), None)[0] == pytest.approx(9 * 10.0 * 0.02)  # it stays
+    assert tail(rest(0.0, 0.0, 0.0), 10.0, gains.per_lane("ki"), None)[0] == 0.0
 
 
 def test_the_worse_a_candidate_fails_the_later_it_comes() -> None:
