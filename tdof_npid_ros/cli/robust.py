@@ -9,6 +9,7 @@ from typing import cast
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline
+from tdof_npid_ros.cli.scheduler import add_scheduler_argument
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file, write_parameters
 from tdof_npid_ros.robustness import RobustError
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same plants (default: 0)")
     add_gain_arguments(parser)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, or its file (default: cores here)")
+    add_scheduler_argument(parser)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="keeps what is done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if it is there")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the worst plants there, files for simulate")

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.interactive import Page, finish_legend, line, new_plot
+from tdof_npid_ros.interactive import Page, finish_legend, new_plot, source_of
+from tdof_npid_ros.interactive import draw as curve
 from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.plotting import GUIDE, PALETTE, new_figure, save
 from tdof_npid_ros.robustness.result import QUANTILES, RobustResult
@@ -147,15 +148,15 @@ def _fan_plot(result: RobustResult, episode: str) -> Any:
     time, fan, nominal = _fan(result, episode)
     signals = result.case.signals[episode]
     plot = new_plot("output", 300)
-    line(plot, signals.time, signals.setpoint, "setpoint", color=GUIDE, dash="dashed", width=1.4, steps=True)
+    setpoint = source_of(signals.time, signals.setpoint, "setpoint", steps=True)
+    curve(plot, setpoint, "setpoint", color=GUIDE, dash="dashed", width=1.4)
     for low, high, alpha in BANDS:
         lower, upper = np.quantile(fan, (low, high), axis=1)
         label = f"{100 * low:g} to {100 * high:g} %"
         plot.varea(time, lower, upper, fill_color=PALETTE[0], fill_alpha=alpha, legend_label=label)
-    line(plot, time, np.median(fan, axis=1), "median", color=PALETTE[0])
-    line(plot, signals.time, nominal, "the model", color=PALETTE[1], dash="dashed")
+    curve(plot, source_of(time, np.median(fan, axis=1), "median"), "median", color=PALETTE[0])
+    curve(plot, source_of(signals.time, nominal, "the model"), "the model", color=PALETTE[1], dash="dashed")
     plot.y_range.start, plot.y_range.end = _limits(fan, nominal)
-    plot.xaxis.axis_label = "time (s)"
     finish_legend(plot)
     return plot
 
@@ -164,14 +165,13 @@ def _histogram_plot(result: RobustResult, name: str) -> Any:
     from bokeh.models import Span
 
     counts, edges = _histogram(result.metrics[name])
-    plot = new_plot("plants", 180)
+    plot = new_plot("plants", 180, x_label=METRICS[name])
     plot.quad(
         top=counts, bottom=0, left=edges[:-1], right=edges[1:], fill_color=PALETTE[0], fill_alpha=0.6, line_color=None
     )
     for quantile in QUANTILES:
         if np.isfinite(value := result.quantile(name, quantile)):
             plot.add_layout(Span(location=value, dimension="height", line_color=PALETTE[1], line_width=1.4))
-    plot.xaxis.axis_label = METRICS[name]
     return plot
 
 
