@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.case import Case, make_case
+from tdof_npid_ros.checkpoint import CheckpointError
 from tdof_npid_ros.cli import main, tune
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.robustness.spread import spreads_of
@@ -87,7 +88,7 @@ def test_stopped_and_resumed_it_ends_as_one_left_alone(tmp_path: Path) -> None:
     resumed = Study(problem(), tmp_path / "run.json", resume=True)
     resumed.run(Objective(resumed.problem))
     assert resumed.result == alone.result
-    with pytest.raises(TuningError, match=r"another problem: robust\.plants"):
+    with pytest.raises(CheckpointError, match=r"another problem: robust\.plants"):
         Study(problem(plants=7), tmp_path / "run.json", resume=True)
 
 
