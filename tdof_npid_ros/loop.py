@@ -28,6 +28,7 @@ from tdof_npid_ros.control.law import (
     law,
     limits_of,
     settled,
+    unwinding_of,
 )
 from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for, plant_input, plant_output
@@ -181,7 +182,8 @@ def _run(
     own = plants.gains if isinstance(plants, LanePlants) else np.arange(lanes)
     of_gains = np.minimum(own, gains.lanes - 1)
     for block in _blocks(gains, of_gains):
-        bounds = limits_of(gains, int(of_gains[block.start])), conditional_integration(gains), limits
+        law_limits = limits_of(gains, int(of_gains[block.start]))
+        bounds = law_limits, conditional_integration(gains), unwinding_of(gains), limits
         width = _width(block.stop - block.start, isinstance(plants, LanePlants))
         y, u = np.empty((2, steps + 1 if len(output) else 0, width))
         of_block = np.minimum(np.arange(block.start, block.start + width), block.stop - 1)
@@ -228,7 +230,7 @@ def _run_block_of(
         its late half does, and at the end.
     """
     width = c.shape[1]
-    initial, state, y_0, u_0 = _beginning(plants, signals, bounds[2], width)
+    initial, state, y_0, u_0 = _beginning(plants, signals, bounds[3], width)
     own_rows = plants.own_rows() if isinstance(plants, LanePlants) else 0
     rows = _aligned_zeros(_X + len(initial) + own_rows, width)
     rows[:COEFFICIENTS] = c
@@ -296,7 +298,8 @@ def _aligned_zeros(rows: int, width: int) -> np.ndarray:
 # What the compiled drivers are given, in plain tuples (see `control/law.py`); arrays of lanes are flat.
 _Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # setpoint, disturbance and weight of the error, each (steps + 1,)
 _Stretch = tuple[int, int]  # the first step, and the one after the last
-_Bounds = tuple[Limits, float, tuple[float, float]]  # the law's limits and anti-windup, the actuator's limits
+# The law's limits, anti-windup and unwinding, the actuator's limits
+_Bounds = tuple[Limits, float, float | None, tuple[float, float]]
 _Memory = tuple[np.ndarray, np.ndarray]  # the lanes' rows, and the efforts on their way through the dead time
 _Outputs = tuple[np.ndarray, np.ndarray]  # y and u, empty if they are not asked for
 
@@ -305,8 +308,8 @@ _Outputs = tuple[np.ndarray, np.ndarray]  # y and u, empty if they are not asked
 def answered(plant: Any, x: Any, u_i: float, z: float, c: Any, bounds: _Bounds, r: float, d: float) -> Any:
     """The first half of a step of one lane: y, u and the plant's input v, then the controller's state after it."""
     y = plant_output(plant, x)
-    limits, conditional, actuator = bounds
-    u, u_i, z, _, _, _, _ = law(c, limits, conditional, r, y, u_i, z)
+    limits, conditional, unwinding, actuator = bounds
+    u, u_i, z, _, _, _, _ = law(c, limits, conditional, unwinding, r, y, u_i, z)
     return y, u, plant_input(plant, applied(u, actuator), d), u_i, z
 
 

@@ -25,6 +25,7 @@ from tdof_npid_ros.control.law import (
     conditional_integration,
     limits_of,
     settled,
+    unwinding_of,
 )
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions
 from tdof_npid_ros.control.shaping import EFFORT, OUTPUT, SETPOINT, STATES, shape_lanes, shape_of
@@ -242,6 +243,7 @@ class _Law:
         self.gains, self.options = gains, options
         self.c, self._limits = coefficients(gains, sample_period_ns / 1e9), limits_of(gains)
         self._conditional = conditional_integration(gains)
+        self._unwinding = unwinding_of(gains) or 0.0  # a number in any case: a change must not have to compile
         self.shape = shape_of(options, sample_period_ns / 1e9)
         self._flat = self.c.ravel()
         lanes = gains.lanes
@@ -266,6 +268,7 @@ class _Law:
                 self._flat,
                 self._limits,
                 self._conditional,
+                self._unwinding,
                 self._low,
                 self._high,
                 setpoint,
@@ -278,7 +281,19 @@ class _Law:
         shape_lanes(self.shape, setpoint, output, self.least, self.most, shaping, self._shaped, self._low, self._high)
         integral = state[INTEGRAL].copy()
         r, y = self._shaped
-        answer_lanes(self._flat, self._limits, self._conditional, self._low, self._high, r, y, state, effort, terms)
+        answer_lanes(
+            self._flat,
+            self._limits,
+            self._conditional,
+            self._unwinding,
+            self._low,
+            self._high,
+            r,
+            y,
+            state,
+            effort,
+            terms,
+        )
         if self.options.manual:
             state[INTEGRAL] = integral  # the law's is set when it takes over again
             np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)

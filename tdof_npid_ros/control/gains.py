@@ -43,6 +43,7 @@ class Gains:
 
     Units: u and y are the effort's and the output's; kp in u/y, ki in u/(y s), kd in u s/y, alpha and beta 1,
     sigma in y, n 1, limits in u, tracking_time in s. A reverse-acting controller has kp, ki, kd <= 0.
+    With full_unwinding, k(e) = 1 wherever that makes the integral action smaller.
 
     Raises:
         GainsError: a value is not finite or out of its range, or the gains contradict each other.
@@ -62,6 +63,7 @@ class Gains:
     tracking_time: float = GAINS["tracking_time"].default
     integral_min: float = GAINS["integral_min"].default
     integral_max: float = GAINS["integral_max"].default
+    full_unwinding: bool = GAINS["full_unwinding"].default
 
     def __post_init__(self) -> None:
         try:

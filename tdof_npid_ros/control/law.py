@@ -24,16 +24,19 @@ Limits = tuple[float, float, float, float]  # of one lane: of the effort, min an
 
 
 @compiled
-def law(c: Any, limits: Limits, conditional: float, r: float, y: float, u_i: float, z: float) -> Any:
+def law(c: Any, limits: Limits, conditional: float, unwinding: Any, r: float, y: float, u_i: float, z: float) -> Any:
     """One sample of the TDOF-NPID law. Returns u, u_i and z for the next sample, u before its limits, ζ, u_p, u_d.
 
     Args: the coefficients of one lane (see `coefficients`), its limits (see `limits_of`), the anti-windup (see
-    `conditional_integration`), r setpoint, y output, u_i integral action, z derivative filter's state.
+    `conditional_integration`), unwinding (see `unwinding_of`), r setpoint, y output, u_i integral action, z derivative
+    filter's state.
     """
     kp, ki_h, kd_h, phi, alpha, beta, q, tracking = c
     u_min, u_max, i_min, i_max = limits
     e = r - y
     zeta = exp_minus(e * e * q) * e  # (3), (4)
+    if unwinding is not None and unwinding * (ki_h * e) * u_i < 0.0:  # beyond the paper: unwinding is not scaled down
+        zeta = e
     u_p = kp * ((1.0 - alpha) * r - y)  # (7)
     e_d = (1.0 - beta) * r - y
     u_d = kd_h * (e_d - z)  # (1b), its mean over the coming sample
@@ -61,6 +64,7 @@ def answer_lanes(
     c: np.ndarray,
     limits: Limits,
     conditional: float,
+    unwinding: float,
     low: np.ndarray,
     high: np.ndarray,
     r: np.ndarray,
@@ -73,7 +77,7 @@ def answer_lanes(
 
     Args:
         c: coefficients, flat (COEFFICIENTS * lanes,); limits: see `limits_of`.
-        conditional: see `conditional_integration`.
+        conditional: see `conditional_integration`; unwinding: 1.0 or 0.0, see `unwinding_of`.
         low, high: limits of the effort at this sample, in place of those in `limits`, (lanes,).
         r, y: setpoint and output, (lanes,).
         state: integral action and derivative filter's state, (2, lanes); advanced in place.
@@ -88,6 +92,7 @@ def answer_lanes(
             lane_coefficients(c, j, lanes),
             (low[j], high[j], i_min, i_max),
             conditional,
+            unwinding,
             r[j],
             y[j],
             u_i,
@@ -162,6 +167,14 @@ def conditional_integration(gains: Gains) -> float:
     Back-calculation is in the coefficients, for it depends on the sample period.
     """
     return float(gains.anti_windup == "conditional")
+
+
+def unwinding_of(gains: Gains) -> float | None:
+    """1.0: the error is not scaled down where its integral makes the integral action smaller; None: it always is.
+
+    None is left out when the law is compiled: the paper's law has the machine code that it would have without this.
+    """
+    return 1.0 if gains.full_unwinding else None
 
 
 def settled(c: np.ndarray, gains: Gains, r: np.ndarray, y: np.ndarray, applied: np.ndarray) -> np.ndarray:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.fields import FieldReader, FieldWriter, parse_fields
 from tdof_npid_ros.control.gains import TUNED, Gains, Lanes, gains_from_mapping
@@ -24,6 +25,7 @@ from tdof_npid_ros.control.joints import SHOWN_NAMES, Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
 from tdof_npid_ros.control.session import FAR_IN_SIGMA, OFF_RATE, OUT_OF_STEP, STUCK, Answer, Outcome, Session
+from tdof_npid_ros.control.stall import Stall, StallWatch
 from tdof_npid_ros.graph.runtime.loop_end import LoopEnd, patience_ns
 from tdof_npid_ros.graph.runtime.messages import lane_names, plan_from_message
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN, shortened
@@ -35,6 +37,7 @@ from tdof_npid_ros.parameters import CONTROLLER, EXPERIMENT, GAINS, LARGEST_SIGN
 from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
 
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
+DRIVEN_OFF = "driven off: the integral action hardly sees so large an error; see k_of_error and integral_rate"
 
 
 class ControllerNode(LoopEnd):
@@ -56,6 +59,8 @@ class ControllerNode(LoopEnd):
         self.session.end_experiment = self._end_experiment
         if given["experiment"]:
             raise ValueError("experiment must be empty at the start: set it once the loop runs")
+        self.stall_watch = StallWatch()
+        self.is_driven_off = False
         self._take_fields(given)
         self.commanded = False  # the topic gives the setpoint, since the activation
         self.checked(given)
@@ -100,6 +105,7 @@ class ControllerNode(LoopEnd):
         """Create topics, services and timers."""
         self.prepare_for_realtime()
         self.session.begin()
+        self.stall_watch.forget()
         self.why_refused = ""  # the latest output, if that was
         self.commanded = False
         self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
@@ -359,6 +365,25 @@ class ControllerNode(LoopEnd):
         """Whether it is in a loop in realtime, whose number of lanes is not ours to change."""
         return self.active and self.session.is_live and not self.session.silent
 
+    def _look_for_stall(self) -> Stall | None:
+        """Whether the loop has been driven off; said once, with the time to expect where a file tells the plant."""
+        stall = self.stall_watch.look(self.controller)
+        before, self.is_driven_off = self.is_driven_off, stall is not None
+        if stall is not None and not before:  # in a thread: the plant's file takes its time
+            threading.Thread(target=self._tell_of_stall, args=(stall, self.controller.gains), daemon=True).start()
+        return stall
+
+    def _tell_of_stall(self, stall: Stall, gains: Gains) -> None:
+        from tdof_npid_ros.stability.creep import time_to_expect  # takes its time, and is rarely needed
+
+        expected = next(
+            (time for _, case in _cases_of(sys.argv) if (time := time_to_expect(case, gains, stall.lane, stall.error))),
+            None,
+        )
+        lasts = f"; with the plant of the file that takes about {expected:.2g} s" if expected else ""
+        remedy = "set full_unwinding" if stall.unwinds and not gains.full_unwinding else "set a larger sigma"
+        self.get_logger().warning(f"{stall}{lasts}. To bring it back, {remedy}, or move the setpoint to the output")
+
     def state(self) -> tuple[int, str, dict[str, object]]:
         """For the diagnostics."""
         facts: dict[str, object] = {
@@ -385,6 +410,9 @@ class ControllerNode(LoopEnd):
             return ERROR, OFF_RATE if session.is_live else OUT_OF_STEP, facts
         if session.guard.name:
             return OK, one_line(f"experiment {session.guard.name} has the loop"), facts
+        if (stall := self._look_for_stall()) is not None:
+            facts |= {"k_of_error": stall.scale, "integral_rate": stall.rate, "error_in_sigma": stall.in_sigma}
+            return ERROR, DRIVEN_OFF, facts
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts
@@ -409,13 +437,16 @@ def _check_sigma(type_: str, hint: str) -> None:
 
 def _of_files(arguments: Sequence[str]) -> str:
     """What the parameter files among a node's arguments say of the setpoint's largest change, for a message."""
+    return next((f" (in {path}: {step:g})" for path, case in _cases_of(arguments) if (step := case.largest_step)), "")
+
+
+def _cases_of(arguments: Sequence[str]) -> Iterator[tuple[str, Case]]:
+    """The parameter files among a node's arguments that are cases, with a plant."""
     for option, path in pairwise(arguments):
         if option == "--params-file":
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                if step := load_case(path).largest_step:
-                    return f" (in {path}: {step:g})"
-    return ""
+                yield path, load_case(path)
 
 
 def main(args: list[str] | None = None) -> None:

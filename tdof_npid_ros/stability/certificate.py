@@ -215,20 +215,23 @@ def _without_features(loop: PdLoop, gains: Gains, linear: Margins) -> Certificat
               "re_g_least_at": round_.omega * rate}  # fmt: skip
     if round_.delta > 0.0:
         return Certificate("certified", "circle", k_max=_or_none(round_.k_max), **known)
-    found = multiplier(loop)
+    found = None if gains.full_unwinding and gains.type != "pid" else multiplier(loop)
     if found is not None:
         return Certificate("certified", "multiplier", **known, **_of_multiplier(found))
     if gains.type == "pid":
         return Certificate("certified", "linear", **known)
-    return Certificate("not certified", reasons=(_no_criterion(round_, rate),), **known)
+    reasons = [_no_criterion(round_, rate)]
+    if gains.full_unwinding:
+        reasons.append("with full_unwinding k(e) depends on the integral action, too: multipliers do not cover that")
+    return Certificate("not certified", reasons=tuple(reasons), **known)
 
 
 def _no_criterion(found: Circle, rate: float) -> str:
     if not math.isfinite(found.at_least):
         return "1 + Re G could not be enclosed between all frequencies, so nothing is proved"
     return (
-        f"1 + Re G falls to {1.0 + found.re_g_least:.4g} at {found.omega * rate:.4g} rad/s, and no multiplier was "
-        f"found; with K_i below {found.k_max:.3f} of its value the circle criterion holds"
+        f"1 + Re G falls to {1.0 + found.re_g_least:.4g} at {found.omega * rate:.4g} rad/s, and no multiplier serves"
+        f"; with K_i below {found.k_max:.3f} of its value the circle criterion holds"
     )
 
 
@@ -339,7 +342,7 @@ def _words(found: Certificate, gains: Gains, creep: Creep | None) -> tuple[tuple
     if found.method == "circle":
         claim.append(
             "It still does if sigma changes while the loop runs, as long as it stays above some value, and if the type "
-            "changes between pid and npid; kp, ki and kd must stay as they are."
+            "changes between pid and npid, or full_unwinding; kp, ki and kd must stay as they are."
         )
     elif found.method == "multiplier":
         claim.append("Type, sigma and gains must stay as they are while the loop runs.")
@@ -348,6 +351,8 @@ def _words(found: Certificate, gains: Gains, creep: Creep | None) -> tuple[tuple
         "lost messages, quantised signals or a setpoint that goes on changing. For these there are the margins.",
     ]
     if creep is not None:
+        if gains.full_unwinding:
+            not_claimed.append("With full_unwinding, what is said of creeping holds where the integral action grows.")
         not_claimed.append(
             "No speed is claimed: of errors much larger than sigma the law integrates next to nothing. From 5 sigma "
             f"to 1 sigma the output creeps for {_seconds(creep.from_sigma_s['5'])}, from 3 sigma for "

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import math
 
+from tdof_npid_ros.case import Case
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.plants.linear import TransferFunction
+from tdof_npid_ros.stability.plant import loop_plant
+
 INTEGRAL_PEAK = math.exp(-0.5)  # the largest value of exp(-e²/2σ²) e, in σ: at |e| = σ
 ACCURATE_FROM = 3.0  # σ: from there on the creep time is right to some 4 %
 
@@ -30,6 +35,22 @@ def creep_time(before: float, after: float, sigma: float, tau: float, re_g_zero:
     x, y = (0.5 * (e / sigma) ** 2 for e in (before, after))
     scaled = math.log(after / before) - y + x  # of ψ(e₁)/ψ(e₀), as a logarithm
     return float(tau * (0.5 * (expi(x) - expi(y)) + abs(re_g_zero) * scaled))
+
+
+def time_to_expect(case: Case, gains: Gains, lane: int, error: float) -> float | None:
+    """How long an error takes until the integral action alone has brought it down to sigma, in s, within some 15 %.
+
+    None where that is beyond the range of floats, or where the plant is not linear.
+
+    Args:
+        error: of the lane, in y.
+    """
+    if not isinstance(case.plant, TransferFunction):
+        return None
+    kp, ki, sigma = (float(gains.per_lane(name)[lane]) for name in ("kp", "ki", "sigma"))
+    tau = abs((1.0 / loop_plant(case).gain + kp) / ki)
+    time = creep_time(abs(error), sigma, sigma, tau, 0.0)
+    return time if math.isfinite(time) else None
 
 
 def fastest_disturbance_ramp(ki: float, sigma: float) -> float:

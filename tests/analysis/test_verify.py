@@ -46,6 +46,14 @@ def test_every_type_of_controller_many_lanes(tmp_path, case, kind, limits) -> No
     assert verify.verify(tmp_path / "bag").equal == 802
 
 
+def test_full_unwinding_is_verified(tmp_path, case) -> None:
+    plain = case.gains.with_values(sigma=0.05)
+    for name, gains in (("on", plain.with_values(full_unwinding=True)), ("off", plain)):
+        write(tmp_path / name, case, gains)
+        account = verify.verify(tmp_path / name)
+        assert (account.equal, account.different, account.unverifiable) == (802, 0, {})
+
+
 def test_one_bit_in_one_effort_is_found_and_named(tmp_path, case, capsys) -> None:
     with LoopBag(tmp_path / "bag") as bag:
         original, seen = bag.write, []

@@ -469,6 +469,37 @@ def test_processor_and_priority_are_taken_or_the_log_says_how_to_allow_them(grap
     assert "cpu 4096 not taken" in controller.log
 
 
+def test_a_loop_that_was_driven_off_is_told_and_brought_back_by_full_unwinding(graph: Any) -> None:
+    """A robot left with an effort of -596, six sigma from its setpoint; a file tells what plant it is."""
+    from sensor_msgs.msg import JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    case = ("--params-file", "config/p1-c4.yaml")
+    controller = graph.start("controller", *case, sample_period=0.1, type="npid", sigma=0.5, output_timeout=0.0)
+    output, message = graph.publisher("output", JointState), JointState(position=[-3.0], effort=[-596.0])
+    message.header.stamp.sec = 100
+    graph.publish_until(output, message, lambda: efforts, what="an answer")
+
+    def until(condition: Any, what: str) -> None:
+        def after_another_output() -> Any:
+            ns = message.header.stamp.nanosec + 100_000_000
+            message.header.stamp.sec, message.header.stamp.nanosec = message.header.stamp.sec + ns // 10**9, ns % 10**9
+            output.publish(message)
+            return condition()
+
+        graph.wait_until(after_another_output, 30, what)
+
+    until(lambda: "was driven off" in controller.log, "the warning")
+    assert efforts[-1].effort[0] == pytest.approx(-596.0, abs=1e-3)
+    until(lambda: graph.fact("/controller", "k_of_error"), "the figures")
+    assert float(graph.fact("/controller", "k_of_error")) == pytest.approx(np.exp(-18.0), rel=1e-3)
+    assert "k(e) is 1.5e-08" in controller.log and "with the plant of the file that takes about" in controller.log
+    assert "set full_unwinding" in controller.log and controller.log.count("was driven off") == 1
+    assert graph.set_parameters("/controller", full_unwinding=True)[0].successful
+    until(lambda: efforts[-1].effort[0] > -595.0, "the integral action to unwind")
+    until(lambda: graph.fact("/controller", "message") == "running", "that all is well")
+
+
 def test_a_second_publisher_and_a_profile_that_does_not_fit_are_reported(graph: Any) -> None:
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import JointState
