@@ -47,6 +47,8 @@ def record(graph: Any, bag: Path, steps: int = STEPS, **options: Any) -> Any:
 def test_lossless_at_full_speed_loses_nothing_and_e1_and_e2_hold(graph: Any, tmp_path: Path) -> None:
     recorder = record(graph, tmp_path / "bag", lossless=True)
     assert recorder.log.strip().endswith("0 lost")
+    plant = next(process for process in graph.processes if process.node == "plant")
+    assert "waiting for the recorder" not in plant.log and "no answer" not in plant.log  # all is well
     with BagReader(tmp_path / "bag") as reader:
         assert reader.custom_data["lost"] == "0"
         assert len(np.unique(reader.columns("/output", ["header.stamp"])["header.stamp"])) == STEPS + 1
@@ -131,6 +133,35 @@ def test_losses_are_counted_and_told(graph: Any, tmp_path: Path) -> None:
         assert lost == published - len(values) > 0
         assert dict(reader.metadata)["recording"]["lost /burst"] == str(lost)
     assert recorder.log.strip().endswith(f"{lost} lost")
+
+
+def test_a_second_publisher_is_no_loss(graph: Any, tmp_path: Path) -> None:
+    """Each counts its own messages; the second one comes late, and its first ones before the recorder knows of it."""
+    from std_msgs.msg import Float64
+
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"), topics=["temperature"])
+    graph.wait_for_nodes("/recorder")
+
+    def recorded() -> int:
+        return int(graph.fact("/recorder", "recorded", 0))
+
+    first = graph.publisher("temperature", Float64, 1000)
+    graph.publish_until(first, Float64(), recorded, what="the first message")
+    for _ in range(500):
+        first.publish(Float64())
+    second = graph.node.create_publisher(Float64, "temperature", 1000)
+    graph.wait_until(second.get_subscription_count, what="the recorder")
+    before = recorded()
+
+    def publish_both() -> int:
+        first.publish(Float64())
+        second.publish(Float64())
+        return recorded()
+
+    graph.wait_until(lambda: publish_both() > before + 700, what="messages of both")
+    assert graph.fresh_fact("/recorder", "lost") == "0" and graph.fact("/recorder", "level") == 0
+    recorder.stop()
+    assert recorder.log.strip().endswith(" 0 lost")
 
 
 def test_a_type_that_is_not_installed_is_left_out(graph: Any, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from trajectory_msgs.msg import JointTrajectory
 from tdof_npid_ros.graph.plant.port import PlantPort
 from tdof_npid_ros.graph.recorder.lossless import Log
 from tdof_npid_ros.graph.runtime.messages import plan_from_message
-from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
+from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WAIT_UNTIL_TOLD, WARN
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.plants.lockstep import Episode
 from tdof_npid_ros.scenario import Plan
@@ -30,7 +30,10 @@ class LockstepPlant:
         """Create the topics and timers, and wait for the plan, which is latched."""
         node = self._node
         self.plan, self.episode = None, None
-        self.waiting, self.repeats, self.clock_ns = (0, 0), 0, -1
+        self.waiting, self.waits_since_ns = (0, 0), 0  # the output that waits for its answer, and since when
+        self.repeats, self.told = 0, False
+        self.was_answered = False  # by any controller, since the activation
+        self.clock_ns = -1
         node.subscribe(JointTrajectory, "scenario_plan", self._on_plan, LATCHED_QOS)
         node.subscribe_signal("control_effort", self._on_answer, node.requested_qos(), sole=True)
         self.held = False  # an output waits for the log
@@ -84,6 +87,7 @@ class LockstepPlant:
         if self._port.phase == "stopped":
             node.get_logger().info("the controller answers again: going on")
             self._port.tell("running")
+        self.was_answered = True
         goes_on = episode.answer(effort)
         if goes_on:
             self._publish_when_logged(episode)
@@ -121,14 +125,19 @@ class LockstepPlant:
         node, episode = self._node, self.episode
         if self._port.phase != "running" or episode is None:
             return
+        waiting = (self._port.label.number, episode.stamp_ns)
+        is_new = waiting != self.waiting
+        if is_new:
+            self.waiting, self.waits_since_ns, self.repeats = waiting, STEADY.now().nanoseconds, 0
+        lasts = STEADY.now().nanoseconds - self.waits_since_ns >= WAIT_UNTIL_TOLD * 1e9
         if self.held or not self._is_logged(episode):
-            node.refuse("held_up", "lossless: waiting for the recorder; start one with lossless in this namespace")
+            node.counts["held_up"] += 1
+            if lasts:
+                node.warn_once("lossless: waiting for the recorder; start one with lossless in this namespace")
             if not self.held:
                 self._port.publish_output(episode.stamp_ns)
             return
-        waiting = (self._port.label.number, episode.stamp_ns)
-        if waiting != self.waiting:
-            self.waiting, self.repeats = waiting, 0
+        if is_new:
             return
         if self.repeats >= node.values_of(["retries"])["retries"]:
             self._port.tell("stopped")
@@ -139,6 +148,9 @@ class LockstepPlant:
             node.publish_diagnostics()
             return
         if self.repeats == 0:
+            self.told = False
+        if not self.told and (self.was_answered or lasts):  # a controller that starts takes its time
+            self.told = True
             node.get_logger().warning(f"no answer to the output at {episode.stamp_ns / 1e9:g} s: repeating it")
         self._repeat_output(episode)
 

@@ -186,7 +186,6 @@ class RecorderNode(LoopNode):
                 self.not_recorded.add(topic)
                 self.get_logger().warning(f"{topic} is not recorded: {one_line(error)}")
                 return
-        tap.publishers = max(tap.publishers, len(offered))
 
     def _tap(self, topic: str, type_name: str, qos: QoSProfile) -> Tap:
         tap = Tap(self, topic, type_name, qos)

@@ -17,6 +17,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from tdof_npid_ros.graph.runtime.sequences import Sequences
 from tdof_npid_ros.interfaces import message_class
 from tdof_npid_ros.wire import EpisodeLabel, SignalReader
 
@@ -47,18 +48,14 @@ class Tap:
 
     Attributes:
         received: messages taken.
-        missed: messages that the publisher had sent before the subscription reached it.
-        lost: messages that DDS reported as lost, or that a gap in the publisher's count shows to be.
     """
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile) -> None:
         self.topic = topic
         self.qos = qos
         self.received = 0
-        self.missed = 0
-        self.publishers = 1
-        self._reported_lost = self._gaps = 0
-        self._next: int | None = None
+        self._sequences = Sequences()
+        self._reported_lost = 0
         self.type_name = type_name
         self._node = node
         self._type = message_class(type_name)
@@ -73,12 +70,17 @@ class Tap:
         )
 
     @property
+    def missed(self) -> int:
+        """Messages that publishers had sent before the subscription reached them."""
+        return self._sequences.missed
+
+    @property
     def lost(self) -> int:
-        """Messages lost so far."""
+        """Messages lost so far: that DDS reports, or that gaps in the publishers' counts show to be."""
         for event in self._subscription.event_handlers:
             event._ready_to_take_data = True  # what an executor's wait set would have said
             self._reported_lost = event.take_data().total_count
-        return max(self._reported_lost, self._gaps)
+        return max(self._reported_lost, self._sequences.lost)
 
     def take(self) -> list[Taken]:
         """What has come since the last look, in order."""
@@ -101,25 +103,12 @@ class Tap:
                 )
         self.received += len(found)
         if found:
-            self._count_gaps(found)
+            self._sequences.take([message.sequence for message in found])
         return found
 
     def close(self) -> None:
         """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
-
-    def _count_gaps(self, found: list[Taken]) -> None:
-        """Compare the publisher's count with what came; with several publishers, DDS's own reports must do."""
-        first, last = found[0].sequence, found[-1].sequence
-        if self._next is None and self.publishers == 1:
-            self.missed = max(0, first - 1)
-        whole = last - first == len(found) - 1 and self._next in (None, first)
-        if not whole and self.publishers == 1:
-            for message in found:
-                if self._next is not None and message.sequence > self._next:
-                    self._gaps += message.sequence - self._next
-                self._next = message.sequence + 1 if message.sequence else None
-        self._next = last + 1 if last else None
 
 
 class LogProgress:
