@@ -8,11 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
 from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
-from tdof_npid_ros.graph.runtime.node import LoopNode
 from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
 from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
@@ -46,7 +46,7 @@ class AlternateLoop:
 
     def __init__(
         self,
-        node: LoopNode,
+        node: Node,
         problem: TuningProblem,
         test: StepTest,
         namespace: str,
@@ -191,13 +191,19 @@ class AlternateLoop:
 
     def _wait(self) -> None:
         """Until what is watched has ended; raises LoopLostError if no outputs come any more."""
-        seen, moved = self._outputs, self._node.silence_ns or 0
+        seen, moved = self._outputs, self._now_ns
         while not self._ended.wait(POLL):
             self._check()
             if self._outputs != seen:
-                seen, moved = self._outputs, self._node.silence_ns or 0
-            elif (self._node.silence_ns or 0) - moved > self._answer_timeout * 1e9:
+                seen, moved = self._outputs, self._now_ns
+            elif self._now_ns - moved > self._answer_timeout * 1e9:
                 raise LoopLostError(f"no output in {self._namespace} for {self._answer_timeout:g} s")
+
+    @property
+    def _now_ns(self) -> int:
+        """Of a clock that is never set, or in simulated time, which may stand still."""
+        clock = self._node.get_clock()
+        return int(clock.now().nanoseconds) if clock.ros_time_is_active else time.monotonic_ns()
 
     def _on_output(self, message: JointState) -> None:
         if not message.position:
