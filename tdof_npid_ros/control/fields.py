@@ -61,47 +61,73 @@ def parse_fields(texts: str | Sequence[str]) -> list[Field]:
 
 
 class FieldReader:
-    """Reads a signal from the messages of one topic.
+    """Reads a signal from the messages of one topic or several.
 
     Args:
         fields: one per lane; or a single one that leads to an array, of which each element is a lane.
+        whole: whether a sample has a new value in every lane; else it has nan in those of other topics.
+
+    Attributes:
+        types: by topic, `package/msg/Type`.
 
     Raises:
-        FieldPathError: the fields are of several topics.
+        FieldPathError: a topic is to have two types.
     """
 
-    def __init__(self, fields: Sequence[Field]) -> None:
-        sources = {(field.path.topic, field.path.type): None for field in fields}
-        if len(sources) != 1:
-            raise FieldPathError(
-                f"the lanes come from {len(sources)} topics ({', '.join(topic for topic, _ in sources)}): take them "
-                "from one, whose messages have one stamp"
-            )
-        ((self.topic, self.type),) = sources
-        self._fields = tuple(fields)
+    def __init__(self, fields: Sequence[Field], whole: bool = True) -> None:
+        self.types: dict[str, str] = {}
+        for path in (field.path for field in fields):
+            if self.types.setdefault(path.topic, path.type) != path.type:
+                raise FieldPathError(f"{path.topic} is to be both {self.types[path.topic]} and {path.type}: a topic "
+                                     "has one type")  # fmt: skip
+        self._fields, self._whole = tuple(fields), whole
         self._takes_names = len(fields) == 1 and fields[0].path.steps[-1].element is None
+        self._new: dict[str, int] = {}  # topics that the next sample has values of, and their stamps
+        self._values: list[np.ndarray] = [np.full(1, np.nan) for _ in fields]
 
-    def read(self, message: Mapping[str, Any], sent_ns: int) -> Sample:
-        """The signal in a message, in `position`.
+    def forget(self) -> None:
+        """What has come belongs to no sample any more."""
+        self._new.clear()
+
+    @property
+    def awaited(self) -> list[str]:
+        """Topics that the next sample waits for."""
+        return [topic for topic in self.types if topic not in self._new]
+
+    def read(self, topic: str, message: Mapping[str, Any], sent_ns: int) -> Sample | None:
+        """The signal, in `position`, as of this message; None where that of other topics has to come first.
+
+        A whole sample bears the latest of its stamps.
 
         Args:
-            message: decoded, by field.
+            message: of the topic, decoded, by field.
             sent_ns: the stamp of a message without a header.
 
         Raises:
             FieldPathError: a field is not there.
         """
-        found = [field.path.select(message) for field in self._fields]
-        values = [
-            one.values * field.scale + field.offset for one, field in zip(found, self._fields, strict=True)
-        ]  # in this order of sums on every machine
+        mine = [i for i, field in enumerate(self._fields) if field.path.topic == topic]
+        found = [self._fields[i].path.select(message) for i in mine]
+        for i, one in zip(mine, found, strict=True):  # in this order of sums on every machine
+            self._values[i] = one.values * self._fields[i].scale + self._fields[i].offset
         header = message.get("header")
         frame_id = ""
         if isinstance(header, Mapping) and "stamp" in header:
             sent_ns = int(header["stamp"]["sec"]) * SECOND + int(header["stamp"]["nanosec"])
             frame_id = str(header.get("frame_id", ""))
         names = found[0].names if self._takes_names else ()
-        return Sample(sent_ns, frame_id, names, np.concatenate(values), NO_VALUES, NO_VALUES)
+        if len(self.types) == 1:
+            return Sample(sent_ns, frame_id, names, np.concatenate(self._values), NO_VALUES, NO_VALUES)
+        self._new[topic] = sent_ns
+        if self._whole and self.awaited:
+            return None
+        values = [
+            its if field.path.topic in self._new else np.full(len(its), np.nan)
+            for its, field in zip(self._values, self._fields, strict=True)
+        ]
+        stamp_ns = max(self._new.values())
+        self._new.clear()
+        return Sample(stamp_ns, "", (), np.concatenate(values), NO_VALUES, NO_VALUES)
 
 
 class FieldWriter:

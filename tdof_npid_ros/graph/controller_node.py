@@ -90,11 +90,11 @@ class ControllerNode(LoopEnd):
         fields = parse_fields(texts)
         if not fields:
             return None
-        reader = FieldReader(fields)
-        self._check_is_another(reader.topic, own)
-        empty = message_class(reader.type)()
+        reader = FieldReader(fields, whole=own == "output")
+        for topic in reader.types:
+            self._check_is_another(topic, own)
         for field in fields:
-            field.path.check(empty)
+            field.path.check(message_class(field.path.type)())
         return reader
 
     def _check_is_another(self, topic: str, own: str) -> None:
@@ -127,6 +127,7 @@ class ControllerNode(LoopEnd):
             for topic, (kind, _) in (self.effort_to.messages.items() if self.effort_to else ())
         }
         if self.output_from is not None:
+            self.output_from.forget()
             self.output = SignalWriter()
             self.output_head: tuple[str, list[str]] = ("", [])
             self.output_publisher = self.publisher_of(JointState, "output", SIGNAL_QOS)
@@ -284,8 +285,8 @@ class ControllerNode(LoopEnd):
         numbers = ", ".join(f"{name} {_short(getattr(gains, name))}" for name in (*TUNED[gains.type], "sigma"))
         joints = f" for {', '.join(self.joints.names[:SHOWN_NAMES])}" if self.joints.names else ""
         rate = 1e9 / self.controller.sample_period_ns
-        output = self.resolve_topic_name(self.output_from.topic if self.output_from else "output")
-        return f"{gains.type}{joints}, {numbers}, {rate:g} Hz, waiting for {output}"
+        outputs = map(self.resolve_topic_name, self.output_from.types if self.output_from else ("output",))
+        return f"{gains.type}{joints}, {numbers}, {rate:g} Hz, waiting for {', '.join(outputs)}"
 
     def completed(self, changes: dict[str, Any]) -> dict[str, Any]:
         """With what an experiment sets or restores together with them."""
@@ -397,7 +398,8 @@ class ControllerNode(LoopEnd):
         if session.stamp_ns is None and self.why_refused:
             return ERROR, one_line(self.why_refused), facts
         if session.stamp_ns is None and self.output_from is not None:
-            return WARN, f"nothing on {self.output_from.topic} yet, where output_from takes the output from", facts
+            awaited = ", ".join(self.output_from.awaited)
+            return WARN, f"nothing on {awaited} yet, where output_from takes the output from", facts
         if session.stamp_ns is None:
             return WARN, "no output yet: start the plant, or remap output to your robot's joint_states", facts
         facts["time_s"] = session.stamp_ns / 1e9

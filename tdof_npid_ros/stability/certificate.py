@@ -215,23 +215,22 @@ def _without_features(loop: PdLoop, gains: Gains, linear: Margins) -> Certificat
               "re_g_least_at": round_.omega * rate}  # fmt: skip
     if round_.delta > 0.0:
         return Certificate("certified", "circle", k_max=_or_none(round_.k_max), **known)
-    found = None if gains.full_unwinding and gains.type != "pid" else multiplier(loop)
+    fixed = not gains.full_unwinding or gains.type == "pid"  # k(e) depends on the error alone
+    found = multiplier(loop) if fixed else None
     if found is not None:
         return Certificate("certified", "multiplier", **known, **_of_multiplier(found))
     if gains.type == "pid":
         return Certificate("certified", "linear", **known)
-    reasons = [_no_criterion(round_, rate)]
-    if gains.full_unwinding:
-        reasons.append("with full_unwinding k(e) depends on the integral action, too: multipliers do not cover that")
-    return Certificate("not certified", reasons=tuple(reasons), **known)
+    aside = "multipliers do not cover full_unwinding" if not fixed else "no multiplier was found"
+    return Certificate("not certified", reasons=(_no_criterion(round_, rate, aside),), **known)
 
 
-def _no_criterion(found: Circle, rate: float) -> str:
+def _no_criterion(found: Circle, rate: float, aside: str) -> str:
     if not math.isfinite(found.at_least):
         return "1 + Re G could not be enclosed between all frequencies, so nothing is proved"
     return (
-        f"1 + Re G falls to {1.0 + found.re_g_least:.4g} at {found.omega * rate:.4g} rad/s, and no multiplier serves"
-        f"; with K_i below {found.k_max:.3f} of its value the circle criterion holds"
+        f"1 + Re G falls to {1.0 + found.re_g_least:.4g} at {found.omega * rate:.4g} rad/s, and {aside}; "
+        f"with K_i below {found.k_max:.3f} of its value the circle criterion holds"
     )
 
 

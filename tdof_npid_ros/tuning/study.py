@@ -121,7 +121,7 @@ class Study:
     @property
     def feasible(self) -> bool:
         """Whether the best so far is allowed: a stable loop that comes to rest with the margins asked for."""
-        return self._optimizer.best_violation == 0.0
+        return self.generation > 0 and self._optimizer.best_violation == 0.0
 
     @property
     def best_told(self) -> str:

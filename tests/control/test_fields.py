@@ -17,7 +17,8 @@ STAMPED, SENT_NS = 3_000_000_005, 7
 
 
 def read(texts: Any, message: Any) -> Any:
-    return FieldReader(parse_fields(texts)).read(message, SENT_NS)
+    fields = parse_fields(texts)
+    return FieldReader(fields).read(fields[0].path.topic, message, SENT_NS)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +55,7 @@ def test_nothing_given_is_no_field() -> None:
         ("/imu sensor_msgs/msg/Imu angular_velocity.z 1 inf", "finite"),
         ("/imu sensor_msgs/msg/Imu z 1 2 3", "no field with its type"),
         ("/i-mu sensor_msgs/msg/Imu z", "is no topic"),
-        (["/a std_msgs/msg/Float64 data", "/b std_msgs/msg/Float64 data"], "from 2 topics"),
+        (["/a std_msgs/msg/Float64 data", "/a std_msgs/msg/Float32 data"], "a topic has one type"),
         ("/imu sensor_msgs/msg/Imu angular_velocity.w", "no field 'w'"),
         ("/imu sensor_msgs/msg/Imu angular_velocity", "leads to no number"),
     ],
@@ -62,3 +63,27 @@ def test_nothing_given_is_no_field() -> None:
 def test_what_is_no_field_is_refused_with_the_reason(texts: Any, reason: str) -> None:
     with pytest.raises(FieldPathError, match=reason):
         read(texts, IMU)
+
+
+TWO = [
+    "/b std_msgs/msg/Float64 data",
+    "/imu sensor_msgs/msg/Imu angular_velocity.z 2",
+    "/b std_msgs/msg/Float64 data -1",
+]
+
+
+def test_an_output_from_several_topics_waits_until_each_has_something_new() -> None:
+    reader = FieldReader(parse_fields(TWO))
+    assert reader.read("/b", {"data": 0.5}, 4) is None and reader.awaited == ["/imu"]
+    assert reader.read("/b", {"data": 0.25}, 6) is None  # the latest counts
+    sample = reader.read("/imu", IMU, SENT_NS)
+    assert sample is not None
+    assert (sample.stamp_ns, sample.position.tolist()) == (STAMPED, [0.25, 6.0, -0.25])
+    assert reader.read("/imu", IMU, SENT_NS) is None and reader.awaited == ["/b"]
+
+
+def test_a_setpoint_from_several_topics_leaves_the_lanes_of_the_others() -> None:
+    reader = FieldReader(parse_fields(TWO), whole=False)
+    for topic, message, values in (("/b", {"data": 0.5}, [0.5, np.nan, -0.5]), ("/imu", IMU, [np.nan, 6.0, np.nan])):
+        sample = reader.read(topic, message, SENT_NS)
+        assert sample is not None and np.array_equal(sample.position, values, equal_nan=True)

@@ -135,6 +135,43 @@ def test_best_effort_joint_states_drive_the_controller_and_what_is_lost_is_count
     graph.publish_until(states, message, lambda: efforts[-1].header.stamp == stamp, what="that it goes on")
 
 
+def test_two_lanes_from_two_topics(graph: Any, tmp_path: Path) -> None:
+    """Each answer has something new of both; a setpoint of one lane leaves the other."""
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64
+
+    efforts = graph.collect("control_effort", JointState)
+    controller = graph.start(
+        "controller", type="pid", kp=2.0, joint_names=["left", "right"], setpoint=0.0, sample_period=0.1,
+        output_from=[f"/{side}/level std_msgs/msg/Float64 data" for side in ("left", "right")],
+        setpoint_from=[f"/{side}/goal std_msgs/msg/Float64 data" for side in ("left", "right")],
+    )  # fmt: skip
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
+    left, right = (graph.publisher(f"/{side}/level", Float64) for side in ("left", "right"))
+    goal = graph.publisher("/right/goal", Float64)
+    graph.wait_for_nodes("/controller", "/recorder")
+    waits = "nothing on /right/level yet"
+    graph.publish_until(left, Float64(data=0.25), lambda: waits in graph.fact("/controller", "message"), what=waits)
+    assert not efforts
+
+    def answered() -> Any:
+        left.publish(Float64(data=0.25))
+        right.publish(Float64(data=0.5))
+        return efforts
+
+    graph.wait_until(answered, what="an answer")
+    assert (list(efforts[-1].effort), list(efforts[-1].name)) == ([-0.5, -1.0], ["left", "right"])
+
+    def commanded() -> Any:
+        goal.publish(Float64(data=2.0))
+        return answered() and list(efforts[-1].position) == [0.0, 2.0]
+
+    graph.wait_until(commanded, what="the setpoint of one")
+    recorder.stop()
+    account = verify(tmp_path / "bag")
+    assert account.different == 0 and account.equal > 1 and "Traceback" not in controller.log
+
+
 def test_without_a_header_the_stamp_is_the_time_of_sending(graph: Any) -> None:
     import time
 

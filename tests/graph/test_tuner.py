@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros.case import Case, load_case
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType, gains_from_mapping
 from tdof_npid_ros.parameter_file import read_parameters
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
@@ -358,13 +358,15 @@ def test_a_disk_that_fills_up_meanwhile_leaves_the_gains_on_the_controller(
 
 @pytest.mark.parametrize("way", ["Ctrl-C", "deactivate"])
 def test_it_ends_with_the_generation_and_leaves_the_best_so_far(
-    loops: Any, tuner_file: Callable[[str], Path], way: str
+    loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path, way: str
 ) -> None:
+    """On the controller and in the result file, and says so."""
     from sensor_msgs.msg import JointState
 
     progress = loops.collect("/p3/tuning_progress", JointState)
     case = str(tuner_file("p3-c1"))
-    process = loops.start("tuner", "-p", f"case:={case}", namespace="/p3", type="pid", **{**QUICK, "generations": 500})
+    options = {**QUICK, "generations": 500, "result": str(tmp_path / "tuned.yaml")}
+    process = loops.start("tuner", "-p", f"case:={case}", namespace="/p3", type="pid", **options)
     loops.wait_until(lambda: len(progress) >= 2, 60, "two generations")
     if way == "deactivate":
         process.stopped = True
@@ -377,6 +379,8 @@ def test_it_ends_with_the_generation_and_leaves_the_best_so_far(
     study.run(Objective(study.problem), lambda study: study.evaluations < evaluations)
     best = study.result.gains
     assert loops.get_parameters("/p3/controller", "type", "kp", "ki", "kd") == ["pid", best.kp, best.ki, best.kd]
+    assert f"the best gains so far are on the controller and in {tmp_path / 'tuned.yaml'};" in process.log
+    assert gains_from_mapping(read_parameters(tmp_path / "tuned.yaml", "controller")) == best
     assert loops.get_parameters("/p3/plant", "lanes") == [1]
 
 
@@ -403,7 +407,9 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     loop = AlternateLoop(tuner.node, which, test, "/real", 60.0, 5.0, lambda: None)
     study = Study(which)
     loops.publisher("/real/output", JointState).publish(JointState())  # malformed; nobody stumbles over it
-    run = threading.Thread(target=lambda: (study.run(loop.evaluate), loop.restore(study.result.gains)))
+    run = threading.Thread(
+        target=lambda: (study.run(loop.evaluate), loop.restore(study.result.gains, study.best_value))
+    )
     run.start()
     loops.wait_until(lambda: not run.is_alive(), 90, "the end of the tuning")
 
@@ -422,3 +428,30 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
         2.0 < max(abs(m.position[0]) for m in outputs if m.position) < 5.0
     )  # one at least was aborted, soon after it left -1 .. 2
     assert study.best_value < 5.0
+
+
+def test_steps_back_and_forth_that_are_interrupted_at_once_leave_the_best_candidate(
+    loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Within the first generation, of which the search knows nothing yet."""
+    from sensor_msgs.msg import JointState
+
+    coarse = {"sample_period": 0.05, "mode": "realtime"}
+    loops.start("plant", case="p1-c0.5", namespace="/cut", speed=20.0, effort_timeout=10.0, **coarse)
+    loops.start("controller", case="p1-c0.5", namespace="/cut", kp=1.0, ki=0.3, kd=0.0, output_timeout=0.0, **coarse)
+    setpoints, result = loops.collect("/cut/setpoint", JointState), tmp_path / "tuned.yaml"
+    process = loops.start(
+        "tuner", "-p", f"case:={tuner_file('p1-c0.5')}", namespace="/cut", type="pid", episode="alternate",
+        settle_band=0.1, time_limit=25.0, result=str(result), **{**QUICK, "population": 200},
+        bounds__kp=[1.0, 5.0], bounds__ki=[0.3, 1.0], bounds__kd=[0.0, 0.5],
+    )  # fmt: skip
+    loops.wait_until(lambda: len({m.position[0] for m in setpoints}) == 2 and len(setpoints) > 8, 90, "candidates")
+    process.send(signal.SIGINT)
+    process.send(signal.SIGINT)
+    process.stopped = True
+    loops.wait_until(lambda: process.process.poll() is not None, 30, "the end of the tuner")
+    (said,) = [line for line in process.log.splitlines() if "interrupted" in line]
+    assert f"0 of 800 evaluations: the best gains so far are on the controller and in {result};" in said
+    kept = gains_from_mapping(read_parameters(result, "controller"))
+    assert loops.get_parameters("/cut/controller", "type", "kp", "ki", "kd") == ["pid", kept.kp, kept.ki, kept.kd]
+    assert (kept.kp, kept.ki, kept.kd) != (1.0, 0.3, 0.0)

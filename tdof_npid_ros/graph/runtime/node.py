@@ -171,24 +171,32 @@ class LoopNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type hints
     def subscribe_fields(
         self, fields: FieldReader, callback: Callable[[Sample], None], qos: QoSProfile, sole: bool = False
     ) -> None:
-        """As `subscribe_signal`, to fields of a topic of any installed type.
+        """As `subscribe_signal`, to fields of topics of any installed type.
 
         Raises:
             ValueError: the type is not installed, or has no such field.
         """
-        topic, definition = fields.topic, parse(fields.type, schema.definition(fields.type))
+        for topic, kind in fields.types.items():
+            on_data = self._reads_fields(fields, topic, kind, callback)
+            self.subscribe(message_class(kind), topic, on_data, qos, sole, raw=True)
+
+    def _reads_fields(
+        self, fields: FieldReader, topic: str, kind: str, callback: Callable[[Sample], None]
+    ) -> Callable[..., None]:
+        definition = parse(kind, schema.definition(kind))
 
         def on_data(*taken: Any) -> None:
             data, info = taken if len(taken) == 2 else taken[0]  # the events executor passes both as one
             try:
-                sample = fields.read(decode_with(definition, data), info["source_timestamp"])
+                sample = fields.read(topic, decode_with(definition, data), info["source_timestamp"])
             except (ValueError, BagError) as error:
                 self.refuse("rejected", f"{topic} refused", f": {error}")
             else:
-                callback(sample)
+                if sample is not None:
+                    callback(sample)
 
         on_data.__signature__ = _WITH_INFO  # type: ignore[attr-defined]  # by it rclpy knows that info is asked for
-        self.subscribe(message_class(fields.type), topic, on_data, qos, sole, raw=True)
+        return on_data
 
     # What `activate` creates is done with after a transition, yet an executor may hold calls of it that were due
     # before.

@@ -95,13 +95,25 @@ class AlternateLoop:
         values, violations = np.array([self._evaluate_one(candidate) for candidate in candidates]).T
         return Scores(values, violations)
 
-    def restore(self, gains: Gains | None) -> None:
-        """Set these gains, or the last good ones."""
-        if self._good is not None:
-            try:
-                self._controller.set_parameters(self._settings(gains or self._good))
-            except (LoopLostError, TuningError) as error:
-                self._node.get_logger().error(f"the controller is left as it is: {error}")
+    def restore(self, gains: Gains | None, objective: float) -> tuple[Gains | None, bool]:
+        """Set the best gains: these, with their objective, or better ones of a generation that was cut short.
+
+        Without any, those before the tuning.
+
+        Returns:
+            The best gains, None without any, and whether they are set.
+        """
+        best = self._good if self._best < objective else gains
+        self._watching = None
+        if self._good is None:
+            return best, best is None  # nothing was changed
+        try:
+            self._controller.set_parameters(self._settings(best or self._good))
+            self._publish_setpoint(self._level)
+        except (LoopLostError, TuningError) as error:
+            self._node.get_logger().error(f"the controller is left as it is: {error}")
+            return best, False
+        return best, True
 
     def close(self) -> None:
         """Leave the graph; no executor may spin the node now."""

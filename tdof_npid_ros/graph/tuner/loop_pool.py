@@ -94,14 +94,21 @@ class LoopPool:
         """
         return scores(self._problem, candidates, *measure(candidates, self._usable, self._on_lost))
 
-    def restore(self, gains: Gains | None) -> None:
-        """Set these gains, or those before the tuning, and one lane on every loop in use."""
+    def restore(self, gains: Gains | None, objective: float) -> tuple[Gains | None, bool]:
+        """Set these gains, or those before the tuning, and one lane on every loop in use.
+
+        Returns:
+            The gains, and whether all loops in use have what they are to have; one at least, if any ever was.
+        """
+        failed = not self.in_use and any(loop.before is not None for loop in self._loops.values())
         for namespace in self.in_use:
             loop = self._loops[namespace]
             try:
                 loop.client.apply(gains or loop.before or self._problem.case.gains)
             except (LoopLostError, TuningError) as error:
+                failed = True
                 self._node.get_logger().error(f"loop {namespace} is left as it is: {error}")
+        return gains, not failed
 
     def close(self) -> None:
         """Leave the graph; no executor may spin the node now."""

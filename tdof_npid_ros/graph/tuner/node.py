@@ -51,8 +51,16 @@ class Evaluator(Protocol):
         """Scores of candidates (n, gains)."""
         ...
 
-    def restore(self, gains: Gains | None) -> None:
-        """Set these gains, or those before the tuning."""
+    def restore(self, gains: Gains | None, objective: float) -> tuple[Gains | None, bool]:
+        """Leave the loops with the best gains.
+
+        Args:
+            gains: the best of whole generations, and their objective; None: there are none yet.
+
+        Returns:
+            The best gains, those of a generation that was cut short among them (None: the loops have those of before
+            the tuning), and whether every loop in use has them.
+        """
         ...
 
     def close(self) -> None:
@@ -81,7 +89,7 @@ class TunerNode(LoopNode):
             check_replaceable(self.result_file, "controller", Gains().as_dict())
         self.accept_changes()
         self.study = Study(self.problem, checkpoint, self.given["resume"])
-        self.how_to_go_on = "start again to go on" if checkpoint else "nothing is kept, for there is no checkpoint"
+        self.how_to_go_on = "start again to go on" if checkpoint else "without a checkpoint, a new start begins anew"
 
     def activate(self) -> None:
         """Look for the loops, and let `run` begin."""
@@ -172,10 +180,11 @@ class TunerNode(LoopNode):
 
         Raises:
             TuningError: it cannot go on; the best gains so far are on the controllers that answer.
-            InterruptedTuningError: asked to stop at once; likewise.
+            InterruptedTuningError: asked to stop before it was activated.
         """
         while not self.activated.wait(POLL):
             self.check_interrupted()
+        left: tuple[Gains | None, bool] = None, False
         for reason in self.problem.restless.values() if self.step_test is None else ():
             self.get_logger().warning(f"{reason}, so no loop comes to rest in it and none is asked to")
         self.report("tuning", "tuning")
@@ -189,15 +198,20 @@ class TunerNode(LoopNode):
                 self.study.run(self.evaluator.evaluate, self._after_generation)
             if self.study.done and self.study.feasible and self.step_test is None:
                 self._confirm()
+        except InterruptedTuningError:
+            pass  # what it leaves, is told below
         finally:
             self.stop_requested = self.stop_at_once = False
-            self.evaluator.restore(self.study.result.gains if self.study.feasible else None)
+            best = self.study.result.gains if self.study.feasible else None
+            left = self.evaluator.restore(best, self.study.best_value)
         if self.study.done:
             self.study.require_feasible()
-            self._write_result()
+            self._write_result(self.study.result.gains)
             self.report("finished", self._finished())
         else:
-            self.report("interrupted", self._interrupted())
+            if left[0] is not None:
+                self._write_result(left[0])
+            self.report("interrupted", self._interrupted(*left))
 
     def interrupt(self) -> None:
         """Stop at the end of the generation; asked again, or while no loop is in use, at once."""
@@ -208,7 +222,7 @@ class TunerNode(LoopNode):
         """Raise InterruptedTuningError if asked to stop at once, or to stop and no loop is left to end the
         generation."""
         if self.stop_at_once or (self.stop_requested and self.activated.is_set() and not self.evaluator.in_use):
-            raise InterruptedTuningError(self._interrupted())
+            raise InterruptedTuningError("interrupted before it began")
 
     def _after_generation(self, study: Study) -> bool:
         self._publish_progress()
@@ -242,9 +256,9 @@ class TunerNode(LoopNode):
         else:
             self.get_logger().error(f"the optimum gave {result.objective!r} when it was found, and gives {value!r} now")
 
-    def _write_result(self) -> None:
+    def _write_result(self, gains: Gains) -> None:
         if self.result_file is not None:
-            write_parameters(self.result_file, {"controller": self.study.result.gains.as_dict()})
+            write_parameters(self.result_file, {"controller": gains.as_dict()})
             self.get_logger().info(f"gains written to {self.result_file}")
 
     def _finished(self) -> str:
@@ -255,8 +269,13 @@ class TunerNode(LoopNode):
         ends = problem.at_bounds(study.result.gains)
         return told + "".join(f"; {name} is at its {end} bound" for name, end in ends.items())
 
-    def _interrupted(self) -> str:
-        return f"interrupted after {self.study.evaluations} of {self.study.budget} evaluations: {self.how_to_go_on}"
+    def _interrupted(self, best: Gains | None, is_set: bool) -> str:
+        what = "the gains of before" if best is None else "the best gains so far"
+        where = f"{what} are on the controller" if is_set else f"{what} could not be set on the controller"
+        if best is not None and self.result_file is not None:
+            where += f" and in {self.result_file}" if is_set else f", but are in {self.result_file}"
+        study = self.study
+        return f"interrupted after {study.evaluations} of {study.budget} evaluations: {where}; {self.how_to_go_on}"
 
     # State
 
