@@ -209,14 +209,15 @@ def test_a_realtime_loop_recorded_before_outputs_bore_labels_began_from_nothing_
     assert verify.verify(tmp_path / "bag").equal == 300
 
 
-def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_path, case) -> None:
+@pytest.mark.parametrize("first_ns", [0, 1_800_000_000_000_000_007])
+def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_path, case, first_ns) -> None:
     with LoopBag(tmp_path / "bag") as bag:
         bag.configuration(case, case.gains)
         controller = Controller(case.gains, case.sample_period_ns)
         for k in range(300):
             if k in (0, 120):
                 controller.reset()
-            stamp, label = k * case.sample_period_ns, f"-/a.{1 + (k >= 120)}"
+            stamp, label = first_ns + k * case.sample_period_ns, f"-/a.{1 + (k >= 120)}"
             y = np.array([np.cos(k / 30)])
             controller.answer(stamp, np.ones(1), y)
             bag.write("output", JOINT_STATE, joint_state(stamp, label, y, [0.0]))

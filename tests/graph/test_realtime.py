@@ -5,12 +5,16 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from test_operation import Live
+
+from tdof_npid_ros.graph.runtime.realtime import LatestTimes, SteadyRosTime
 
 SOAK_SECONDS = float(os.environ.get("TDOF_SOAK_SECONDS", "20"))
 WARM_UP_SECONDS = min(60.0, SOAK_SECONDS / 2)
@@ -69,6 +73,28 @@ def test_stamps_are_ros_time_on_one_grid_and_go_on_over_a_reset(graph: Any) -> N
     joined = [stamp for one in stamps.values() for stamp in one]
     assert joined == sorted(set(joined))
     assert not graph.node.get_publishers_info_by_topic("/clock")
+
+
+def test_a_late_tick_shifts_no_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first one is stamped with the time at which it was due; those after it come a period later each."""
+    from tdof_npid_ros.graph.plant import realtime
+
+    stamps: list[int] = []
+    settings = {"effort_timeout": 0.0, "fallback": "hold", "fallback_effort": 0.0, "return_time": 0.0}
+    node = SimpleNamespace(counts=Counter(), values_of=lambda names: settings)
+    simulator = SimpleNamespace(lanes=1, applied_effort=np.zeros(1), advance=lambda effort, disturbance: None)
+    port = SimpleNamespace(
+        node=node, period_ns=10, simulator=simulator, publish_output=stamps.append, publish_clock=lambda time_ns: None
+    )
+    plant = realtime.RealtimePlant(port)  # type: ignore[arg-type]
+    plant.wall_period_ns, plant.due_from_ns, plant.clock_told_ns = 10, 3, 0
+    plant.ros_time, plant.period_error = SteadyRosTime(10**18, 3), LatestTimes()
+    plant._start()
+    for now in (46, 54, 63, 97, 103):  # due at 43, 53, 63, 73 (missed), 83 (missed), 93, 103
+        monkeypatch.setattr(realtime, "STEADY", SimpleNamespace(now=lambda now=now: SimpleNamespace(nanoseconds=now)))
+        plant._on_tick()
+    assert stamps == [10**18 + 40 + 10 * k for k in range(5)]
+    assert node.counts["missed_ticks"] == 2
 
 
 def test_with_use_sim_time_silence_counts_in_simulated_time(graph: Any) -> None:
