@@ -141,8 +141,8 @@ def robust(
     Example:
         >>> from tdof_npid_ros import load_case, robust
         >>> result = robust(load_case("p3-c1"), ["gain 30 %", "time_constant 20 %"], samples=64, sampling="latin")
-        >>> result.unstable_fraction
-        0.125
+        >>> 0.0 < result.unstable_fraction < 0.2
+        True
     """
     its = spreads_of(case, spreads, sampling)
     with workers(scheduler) as here:
