@@ -31,6 +31,7 @@ BENCH = [
 ]
 EXAMPLES = ["mujoco-core>=4; python_version >= '3.11'"]  # without its viewers: 10 MB
 TEST = [
+    "argcomplete",
     "pytest>=8",
     "pytest-timeout",
     "pytest-xdist",

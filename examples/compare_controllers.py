@@ -15,7 +15,7 @@ def main(bag: str) -> None:
     case = load_case(CASE)
     with run(CASE, bag=bag) as loop:
         for controller in ("pid", "tdof_npid2"):
-            loop.use(tune(case, controller, seed=1).gains)
+            loop.use(tune(case, controller, seed=1, generations=30).gains)
             loop.play()  # all episodes of the case: here setpoint and disturbance
             loop.wait()
     print(analyze([bag]).table())

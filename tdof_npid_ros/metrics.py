@@ -45,6 +45,33 @@ class DisturbanceMetrics:
     reason: str | None = None
 
 
+@dataclass(frozen=True)
+class EffortUse:
+    """What one lane's control costs; None where there is no effort, or its limits are not known.
+
+    Attributes:
+        total_variation: sum of |u[k+1] - u[k]|.
+        peak: largest |u|.
+        saturated_share: fraction of the samples at a limit.
+    """
+
+    total_variation: float | None
+    peak: float | None
+    saturated_share: float | None
+
+
+def effort_use(effort: np.ndarray, limits: tuple[float, float] | None) -> EffortUse:
+    """What an effort of shape (samples,) costs.
+
+    Args:
+        limits: the tightest that act on it; None: not known.
+    """
+    if not effort.size:
+        return EffortUse(None, None, None)
+    at_limit = None if limits is None else float(np.mean((effort <= limits[0]) | (effort >= limits[1])))
+    return EffortUse(float(np.abs(np.diff(effort)).sum()), float(np.abs(effort).max()), at_limit)
+
+
 def difference(a: np.ndarray | float, b: np.ndarray | float, turn: float = 0.0) -> np.ndarray:
     """a - b, as angles within half a turn."""
     plain = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)

@@ -87,6 +87,14 @@ AUTOSTART: Final = Parameter(
     fixed=True,
     of_loop=True,
 )
+RELIABILITY: Final = Parameter(
+    "reliability",
+    "reliable",
+    "of what is taken: best_effort hears publishers that send so, too, and asks for no lost message again",
+    choices=("reliable", "best_effort"),
+    fixed=True,
+    of_loop=True,
+)
 TIMING: Final = (
     Parameter(
         "deadline",
@@ -113,14 +121,7 @@ TIMING: Final = (
         fixed=True,
         of_loop=True,
     ),
-    Parameter(
-        "reliability",
-        "reliable",
-        "of what is taken: best_effort hears publishers that send so, too, and asks for no lost message again",
-        choices=("reliable", "best_effort"),
-        fixed=True,
-        of_loop=True,
-    ),
+    RELIABILITY,
     Parameter(
         "priority",
         0,
@@ -567,6 +568,7 @@ RECORDER: Final = table(
         fixed=True,
     ),
     Parameter("exclude", [""], "patterns of topics to leave out", fixed=True),
+    RELIABILITY,
     LOSSLESS,
     AUTOSTART,
 )

@@ -9,7 +9,7 @@ from typing import Any
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import LIMITS_PER_LANE, PER_LANE, Gains
 from tdof_npid_ros.loop import Trajectory
-from tdof_npid_ros.metrics import in_units
+from tdof_npid_ros.metrics import effort_use, in_units
 from tdof_npid_ros.plotting import Curve, Panel
 from tdof_npid_ros.stability.margins import Margins, margins
 
@@ -17,9 +17,13 @@ METRICS = {
     ("setpoint", "overshoot_percent"): "setpoint: overshoot (%)",
     ("setpoint", "settling_time_s"): "setpoint: settling time (s)",
     ("setpoint", "iae"): "setpoint: IAE",
+    ("setpoint", "effort_peak"): "setpoint: largest |u|",
+    ("setpoint", "saturated_percent"): "setpoint: at limit (%)",
     ("disturbance", "peak"): "disturbance: peak",
     ("disturbance", "recovery_time_s"): "disturbance: recovery time (s)",
     ("disturbance", "iae"): "disturbance: IAE",
+    ("disturbance", "effort_peak"): "disturbance: largest |u|",
+    ("disturbance", "saturated_percent"): "disturbance: at limit (%)",
 }
 Runs = dict[str, dict[str, Trajectory]]
 """By episode, by what the gains are called."""
@@ -36,8 +40,7 @@ def simulated(case: Case, of: Mapping[str, Gains]) -> Runs:
 
 def panels(case: Case, runs: Runs) -> list[Panel]:
     """A picture's panel for each episode."""
-    low, high = (float(case.gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
-    limits = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
+    limits = tightest_limits(case, case.gains)
     return [
         Panel(
             name,
@@ -51,6 +54,24 @@ def panels(case: Case, runs: Runs) -> list[Panel]:
     ]
 
 
+def tightest_limits(case: Case, gains: Gains) -> tuple[float, float]:
+    """Between which the effort is, whether plant or controller limits it."""
+    low, high = (float(gains.per_lane(limit)[0]) for limit in LIMITS_PER_LANE)
+    return max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
+
+
+def control_cost(case: Case, episode: str, gains: Gains) -> dict[str, float | None]:
+    """What the control of an episode costs, as `analyze` calls it.
+
+    Returns:
+        The sum of |Δu|, the largest |u|, and for how much of the time the effort is at a limit.
+    """
+    effort = case.simulate(episode, gains).control_effort[:, 0]
+    use = effort_use(effort, tightest_limits(case, gains))
+    at_limit = None if use.saturated_share is None else 100.0 * use.saturated_share
+    return {"effort_variation": use.total_variation, "effort_peak": use.peak, "saturated_percent": at_limit}
+
+
 def numbers(case: Case, of: Mapping[str, Gains]) -> list[list[str]]:
     """Metrics and margins as a table, titles first, one column for each of the gains.
 
@@ -59,8 +80,8 @@ def numbers(case: Case, of: Mapping[str, Gains]) -> list[list[str]]:
     """
     found = {
         label: {
-            "setpoint": asdict(case.setpoint_response(gains)),
-            "disturbance": asdict(case.disturbance_response(gains)),
+            "setpoint": asdict(case.setpoint_response(gains)) | control_cost(case, "setpoint", gains),
+            "disturbance": asdict(case.disturbance_response(gains)) | control_cost(case, "disturbance", gains),
         }
         for label, gains in of.items()
     }

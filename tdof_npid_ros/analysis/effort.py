@@ -11,22 +11,8 @@ from tdof_npid_ros.analysis.episodes import Episode
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.law import limits_of
 from tdof_npid_ros.loop import simulate
+from tdof_npid_ros.metrics import EffortUse, effort_use
 from tdof_npid_ros.plants.plant import PlantError
-
-
-@dataclass(frozen=True)
-class EffortUse:
-    """What one lane's control costs; None where the bag holds no control effort, or no limits.
-
-    Attributes:
-        total_variation: sum of |u[k+1] - u[k]|.
-        peak: largest |u|.
-        saturated_share: fraction of the samples at a limit.
-    """
-
-    total_variation: float | None
-    peak: float | None
-    saturated_share: float | None
 
 
 @dataclass(frozen=True)
@@ -39,19 +25,15 @@ class Deviation:
     reason: str | None = None
 
 
-def effort_use(episode: Episode, lane: int) -> EffortUse:
+def episode_effort(episode: Episode, lane: int) -> EffortUse:
     """What one lane's control costs over the episode."""
     u = episode.control_effort[:, lane]
-    u = u[~np.isnan(u)]
-    if not u.size:
-        return EffortUse(None, None, None)
-    fraction = None
+    tightest = None
     if episode.gains:
         limits = [limits_of(gains, min(lane, gains.lanes - 1))[:2] for gains in episode.gains]
         limits.append(_limits(episode))
-        low, high = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
-        fraction = float(np.mean((u <= low) | (u >= high)))
-    return EffortUse(float(np.abs(np.diff(u)).sum()), float(np.abs(u).max()), fraction)
+        tightest = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
+    return effort_use(u[~np.isnan(u)], tightest)
 
 
 def deviation(episode: Episode) -> Deviation:

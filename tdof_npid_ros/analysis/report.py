@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdof_npid_ros.analysis import page, picture
-from tdof_npid_ros.analysis.effort import Deviation, EffortUse, deviation, effort_use
+from tdof_npid_ros.analysis.effort import Deviation, deviation, episode_effort
 from tdof_npid_ros.analysis.episodes import Episode, bag_names, episodes_in
 from tdof_npid_ros.analysis.loop_margins import episode_margins
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, in_units
+from tdof_npid_ros.metrics import DisturbanceMetrics, EffortUse, SetpointMetrics, in_units
 from tdof_npid_ros.parameters import NOISE, PLANT
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
@@ -198,7 +198,7 @@ def _report(episode: Episode) -> EpisodeReport:
     return EpisodeReport(
         episode,
         tuple(tuple(responses(episode.lane(lane))) for lane in lanes),
-        tuple(effort_use(episode, lane) for lane in lanes),
+        tuple(episode_effort(episode, lane) for lane in lanes),
         deviation(episode),
         episode_margins(episode),
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -44,6 +46,7 @@ SUBCOMMANDS = {
 USAGE_ERROR = 2
 LONGEST_ERROR = 2000  # characters
 INTERRUPTED = 130  # as a shell gives it after Ctrl-C
+COMPLETING = "_ARGCOMPLETE"  # environment variable: a shell asks how a line may go on
 READER_GONE = 141  # as a shell gives it when the reader of a pipe has gone
 
 
@@ -62,6 +65,8 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit status: 0 only on success, 2 for bad input."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if COMPLETING in os.environ and arguments is None:
+        given = os.environ.get("COMP_LINE", "").split()[1:]
     name = given[0] if given and given[0] in SUBCOMMANDS else ""
     try:
         status = _run(given, name)
@@ -87,7 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(given: list[str], chosen: str) -> int:
     parser = _Parser(prog="tdof-npid", description="Nonlinear two-degree-of-freedom PID control loops.")
     parser.add_argument("--version", action="version", version=f"tdof-npid {__version__}")
-    if given and not chosen and not given[0].startswith("-"):
+    completing = COMPLETING in os.environ
+    if given and not chosen and not given[0].startswith("-") and not completing:
         parser.error(f"there is no subcommand {given[0]!r}{meant_hint(given[0], SUBCOMMANDS)}")
     parser_of_chosen = parser
     subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
@@ -97,10 +103,18 @@ def _run(given: list[str], chosen: str) -> int:
         if name == chosen:
             parser_of_chosen = subparser
             importlib.import_module(f"{__name__}.{name}").add_arguments(subparser)
+    if completing:
+        _complete(parser)
     parsed, strange = parser.parse_known_args(given)
     if strange:
         parser_of_chosen.refuse(strange)
     return int(importlib.import_module(f"{__name__}.{parsed.subcommand}").run(parsed))
+
+
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Tell the shell how the line may go on, and end, where `argcomplete` is installed and the shell has asked."""
+    with contextlib.suppress(ModuleNotFoundError):
+        importlib.import_module("argcomplete").autocomplete(parser)
 
 
 def _message(error: Exception) -> str:

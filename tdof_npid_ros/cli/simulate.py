@@ -23,7 +23,7 @@ from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.plotting import Panel, draw_responses
-from tdof_npid_ros.prediction import gains_table, numbers, panels, shown, simulated
+from tdof_npid_ros.prediction import control_cost, gains_table, numbers, panels, shown, simulated
 from tdof_npid_ros.stability.margins import margins
 
 
@@ -50,11 +50,17 @@ def run(arguments: argparse.Namespace) -> int:
     report = response_report(case, gains) | {"margins": found.as_dict()} | advised(case, gains)
     write_responses(case, {title(gains): gains}, arguments)
     lines = [headline(case, gains), *_table(report), *(f"  margins      {line}" for line in found.lines())]
+    lines += written(outputs_of(arguments))
     if arguments.json:
         print(json.dumps(report))
     else:
         say(lines)
     return 0
+
+
+def written(paths: Sequence[Path]) -> list[str]:
+    """Where the things are that were written, a line for each."""
+    return [f"  written: {path}" for path in paths]
 
 
 def outputs_of(arguments: argparse.Namespace) -> list[Path]:
@@ -107,8 +113,8 @@ def response_report(case: Case, gains: Gains) -> dict[str, Any]:
     setpoint, disturbance = case.setpoint_response(gains), case.disturbance_response(gains)
     return {
         **loop_report(case, gains),
-        "setpoint": _without_empty_reason(asdict(setpoint)),
-        "disturbance": _without_empty_reason(asdict(disturbance)),
+        "setpoint": _without_empty_reason(asdict(setpoint)) | control_cost(case, "setpoint", gains),
+        "disturbance": _without_empty_reason(asdict(disturbance)) | control_cost(case, "disturbance", gains),
         "objective": setpoint.iae + case.weight * disturbance.iae,
     }
 

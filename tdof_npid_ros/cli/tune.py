@@ -28,6 +28,7 @@ from tdof_npid_ros.cli.simulate import (
     response_report,
     title,
     write_responses,
+    written,
 )
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, Gains, controller_type
 from tdof_npid_ros.metrics import in_units
@@ -142,8 +143,10 @@ def run(arguments: argparse.Namespace) -> int:
         report |= {"robust": _robust_report(problem, result.objective, unseen)}
     if arguments.out:
         write_parameters(arguments.out, {"controller": result.gains.as_dict()})
-    write_responses(problem.case, _compared(problem, result.gains), arguments)
+    if outputs_of(arguments):
+        write_responses(problem.case, _compared(problem, result.gains), arguments)
     lines = [_summary(report, found), *(_robust_lines(report["robust"], unseen) if unseen is not None else [])]
+    lines += written([*([arguments.out] if arguments.out else []), *outputs_of(arguments)])
     print(json.dumps(report) if arguments.json else "\n".join(lines))
     return 0
 
@@ -330,6 +333,14 @@ def _is_near(found: Margins) -> bool:
 
 
 def _compared(problem: TuningProblem, tuned: Gains) -> dict[str, Gains]:
-    """What the tuned gains stand beside in a picture: those of the file."""
+    """What the tuned gains stand beside in a picture: those of the file, and PID tuned in the same way."""
     before = problem.case.gains
-    return {f"{title(before)} before": before, f"{title(tuned)} tuned": tuned}
+    curves = {f"{title(before)} before": before, f"{title(tuned)} tuned": tuned}
+    if tuned.type != "pid":
+        study = Study(replace(problem, controller="pid", extra=()))
+        study.run(Objective(study.problem))
+        if study.feasible:
+            curves["PID tuned"] = study.result.gains
+        else:
+            warnings.warn("no PID with the margins that were asked for was found to stand beside", stacklevel=2)
+    return curves

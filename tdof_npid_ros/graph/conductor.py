@@ -23,6 +23,7 @@ from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.wire import EpisodeLabel
 
 POLL = 0.02  # s
+FOUND = 3.0  # s in which a new publisher is found by those who listen
 
 
 class LoopError(RuntimeError):
@@ -151,6 +152,12 @@ class Conductor:
         """
         self.remote(node).set_parameters(parameters)
 
+    def prepare_to_publish(self, *topics: str) -> None:
+        """Let those who listen to these topics find their publisher ahead: whoever has not found it hears nothing."""
+        for topic in topics:
+            if topic not in self._publishers:
+                self._publishers[topic] = self.node.create_publisher(JointState, topic, 10)
+
     def publish(self, topic: str, values: Sequence[float], joints: Sequence[str], timeout: float) -> None:
         """Give a setpoint, a disturbance or a manual effort on its topic, once somebody hears it.
 
@@ -160,10 +167,15 @@ class Conductor:
         Raises:
             LoopError: nobody does within `timeout` seconds.
         """
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(JointState, topic, 10)
-        publisher = self._publishers[topic]
-        self.wait(publisher.get_subscription_count, f"subscription of {topic}", timeout)
+        self.prepare_to_publish(topic)
+        publisher, patient_until = self._publishers[topic], time.monotonic() + FOUND
+
+        def is_heard() -> bool:
+            """By all who listen, as far as they can be had: by the controller, not by a recorder alone."""
+            heard = publisher.get_subscription_count()
+            return bool(heard) and (heard >= self.node.count_subscribers(topic) or time.monotonic() > patient_until)
+
+        self.wait(is_heard, f"subscription of {topic}", timeout)
         publisher.publish(given_message(topic, values, self.node, joints))
 
     def play(self, timeout: float) -> None:

@@ -38,6 +38,7 @@ END_BY_THEMSELVES = ("tuner", "replay")
 START_TIMEOUT = 60.0  # s; the first start compiles
 STANDS_STILL = 20.0  # s without a step of the plant until nothing is waited for any longer
 POLL = 0.05  # s
+GIVEN = ("setpoint", "disturbance", "manual_effort")  # what a script may publish, where no scenario does
 # Who publishes a topic of the loop, and who takes it; a recorder comes to what is published.
 TOPICS = {
     "output": ("plant", ("controller",)),
@@ -251,6 +252,8 @@ def run(
         start_nodes(processes, loaded, path, folder, given, play=False, nodes=nodes)
         conductor = Conductor(namespace, processes.check)
         try:
+            if "scenario" not in nodes:
+                conductor.prepare_to_publish(*GIVEN)
             conductor.wait_for_subscriptions(_subscribers(nodes, remap or {}, folder is not None), START_TIMEOUT)
             yield RunningLoop(loaded, conductor, processes, folder)
         finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,22 @@ def test_an_argument_that_a_subcommand_does_not_have_is_told_with_the_one_that_i
     assert ended.value.code == 2
     said = "tdof-npid simulate: unrecognized arguments: --plto x.png: --plot is meant?: see tdof-npid simulate --help\n"
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(
+    ("line", "found"), [("tdof-npid simul", {"simulate"}), ("tdof-npid simulate p1-c4 --ki", {"--ki"})]
+)
+def test_a_shell_is_told_how_a_line_may_go_on(line: str, found: set[str], tmp_path: Path) -> None:
+    pytest.importorskip("argcomplete", reason="completion is optional: pip install argcomplete")
+    answer = tmp_path / "answer"
+    environment = {
+        **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
+    }  # fmt: skip
+    code = "from tdof_npid_ros.cli import entry; entry()"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert {word.strip() for word in answer.read_text().split("\n")} == found
 
 
 @pytest.mark.parametrize("node", ["controller", "plant", "tuner", "recorder"])

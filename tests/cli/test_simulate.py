@@ -30,6 +30,25 @@ def test_json_has_the_keys_of_the_contract(capsys: pytest.CaptureFixture[str]) -
     assert report["objective"] == report["setpoint"]["iae"] + report["disturbance"]["iae"]  # type: ignore[index]
 
 
+def test_what_the_control_costs_is_told_as_analyze_tells_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file, text = tmp_path / "limited.yaml", (config_folder() / "p1-c4.yaml").read_text()
+    file.write_text(
+        text.replace("/**/plant:\n  ros__parameters:\n", "/**/plant:\n  ros__parameters:\n    effort_max: 2.0\n")
+    )
+    case = load_case(file)
+    report = simulated(capsys, str(file))
+    gains = case.gains
+    for episode in ("setpoint", "disturbance"):
+        u = case.simulate(episode, gains).control_effort[:, 0]
+        found = report[episode]
+        assert found["effort_peak"] == abs(u).max()  # type: ignore[index]
+        assert found["effort_variation"] == abs(u[1:] - u[:-1]).sum()  # type: ignore[index]
+        assert found["saturated_percent"] == 100.0 * (u >= 2.0).mean()  # type: ignore[index]
+    assert report["setpoint"]["saturated_percent"] > 1.0  # type: ignore[index]
+    assert main(["simulate", "p1-c4", "--csv", str(tmp_path / "r.csv")]) == 0
+    assert f"  written: {tmp_path / 'r.csv'}\n" in capsys.readouterr().out
+
+
 def test_single_gains_override(capsys: pytest.CaptureFixture[str]) -> None:
     report = simulated(capsys, "p1-c4", "--controller", "tdof_npid1", "--kp", "1.25", "--alpha", "0.5")
     assert (report["gains"]["kp"], report["gains"]["alpha"]) == (1.25, 0.5)  # type: ignore[index]

@@ -15,6 +15,7 @@ import yaml
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
+from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.parameter_file import config_folder, write_parameters
 from tdof_npid_ros.tuning.study import tune_case
 
@@ -165,6 +166,22 @@ def test_ros_reads_the_parameter_file(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_the_convergence_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tuned(capsys, "--controller", "pid", "--plot", str(tmp_path / "convergence"))
     assert (tmp_path / "convergence").read_bytes().startswith(b"\x89PNG")
+
+
+def test_tuned_gains_stand_beside_those_of_before_and_pid_tuned_alike(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    csv, out = tmp_path / "r.csv", tmp_path / "gains.yaml"
+    assert main(["tune", *QUICK, "--controller", "tdof_npid2", "--csv", str(csv), "--out", str(out)]) == 0
+    assert capsys.readouterr().out.endswith(f"  written: {out}\n  written: {csv}\n")
+    rows = csv.read_text().splitlines()[1:]
+    curves = dict.fromkeys(row.split(",")[1] for row in rows)
+    assert list(curves) == ["TDOF-NPID2 before", "TDOF-NPID2 tuned", "PID tuned"]
+    pid = tuned(capsys, "--controller", "pid")
+    case = load_case(QUICK[0])
+    run = case.simulate("setpoint", Gains(type="pid", **{name: pid["gains"][name] for name in ("kp", "ki", "kd")}))
+    outputs = [float(row.split(",")[5]) for row in rows if row.startswith("setpoint,PID tuned")]
+    assert outputs == run.output[:, 0].tolist()
 
 
 def test_people_see_the_optimum_and_a_log_no_progress(capsys: pytest.CaptureFixture[str]) -> None:

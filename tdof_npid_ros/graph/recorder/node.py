@@ -56,6 +56,7 @@ EXPECTED = {
 }
 
 
+FROM_ROBOTS = ("output", "setpoint")
 LATCHED = ("scenario_plan", "episode")
 
 
@@ -72,6 +73,7 @@ class RecorderNode(LoopNode):
         self.max_bytes, self.max_duration = given["max_bytes"], given["max_duration"]
         self.topics, self.exclude = given["topics"], given["exclude"]
         self.lossless = given["lossless"]
+        self.reliable = given["reliability"] == "reliable"  # what robots publish, before one does
         self.accept_changes()
         self._begin_account()
         self.taps: dict[str, Tap] = {}
@@ -98,7 +100,7 @@ class RecorderNode(LoopNode):
         for name, kind in EXPECTED.items():
             topic = self.resolve_topic_name(name)
             if self._wanted(topic):
-                self._tap(topic, kind, _expected_qos(name))
+                self._tap(topic, kind, _expected_qos(name, self.reliable))
         if self.lossless:
             self.progress = LogProgress([self.resolve_topic_name(name) for name in ("output", "control_effort")])
             self.progress_publisher = self.create_publisher(JointState, TOPIC, SIGNAL_QOS)
@@ -341,9 +343,11 @@ def _profile(qos: QoSProfile) -> QosProfile:
     )
 
 
-def _expected_qos(name: str) -> QoSProfile:
+def _expected_qos(name: str, reliable: bool) -> QoSProfile:
     durability = DurabilityPolicy.TRANSIENT_LOCAL if name in LATCHED else DurabilityPolicy.VOLATILE
-    return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+    hears_all = name in FROM_ROBOTS and not reliable
+    reliability = ReliabilityPolicy.BEST_EFFORT if hears_all else ReliabilityPolicy.RELIABLE
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=reliability, durability=durability)
 
 
 def _as_reliable_as(offered: list[QoSProfile]) -> QoSProfile:
