@@ -15,6 +15,7 @@ from tdof_npid_ros import loop
 from tdof_npid_ros.control.gains import PER_LANE, Gains, GainsError, gains_from_mapping
 from tdof_npid_ros.control.options import PLAIN, ControllerOptions, options_from_mapping
 from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturbance_metrics, setpoint_metrics
+from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameter import Table
 from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
 from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
@@ -262,7 +263,7 @@ def load_case(name: str | Path) -> Case:
     path = find_parameter_file(name)
     nodes = {node: read_parameters(path, node) for node in _OF_CASE}
     try:
-        return _case_of(path.stem, nodes, path.parent, str(path))
+        return _case_of(as_text(path.stem), nodes, path.parent, str(path))
     except ValueError as error:
         raise type(error)(f"{path}: {error}") from error
 

@@ -1,7 +1,9 @@
-"""Text from outside, fit to be a part of one line on a terminal or in a log."""
+"""Text from outside, fit to be a part of one line on a terminal or in a log, or of a file."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Final
 
 LONGEST: Final = 500  # characters: more than any message of ours needs
@@ -22,3 +24,12 @@ def one_line(text: object, longest: int = LONGEST) -> str:
         return line
     tail = longest // 4
     return f"{line[: longest - tail - 3]} … {line[-tail:]}"
+
+
+def as_text(path: str | Path) -> str:
+    """A path as text that any file or picture may hold: bytes in it that are not UTF-8 as escapes.
+
+    >>> as_text(os.fsdecode(b"gr\\xfc\\xdfe")), as_text("größe")
+    ('gr\\\\xfc\\\\xdfe', 'größe')
+    """
+    return os.fsencode(path).decode("utf-8", "backslashreplace")

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from tdof_npid_ros.input_file import InputError, read_yaml
+from tdof_npid_ros.one_line import as_text
 
 
 class ParameterFileError(ValueError):
@@ -97,6 +98,18 @@ def check_replaceable(path: Path, node: str, names: Collection[str]) -> None:
     values = read_parameters(path, node)
     if not set(values) <= set(names) or path.read_text("utf-8") != _text({node: values}):
         raise ParameterFileError(f"{path} holds more than such a result, which would be lost: give another file")
+
+
+def for_ros(path: str | Path) -> str:
+    """A path as text that ROS takes.
+
+    Raises:
+        ParameterFileError: it does not: bytes in it are not UTF-8.
+    """
+    text = str(path)
+    if as_text(text) != text:
+        raise ParameterFileError(f"{as_text(text)}: ROS takes names in UTF-8 alone: rename the file or folder")
+    return text
 
 
 def write_parameters(path: Path, nodes: dict[str, dict[str, Any]]) -> None:

@@ -18,6 +18,7 @@ from tdof_npid_ros.analysis.loop_margins import episode_margins
 from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
 from tdof_npid_ros.bag.reader import BagReader
 from tdof_npid_ros.metrics import DisturbanceMetrics, EffortUse, SetpointMetrics, in_units
+from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameters import NOISE, PLANT
 from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
@@ -183,8 +184,8 @@ def analyze(paths: Iterable[str | Path], chosen: Chosen = NOTHING_CHOSEN) -> Rep
     missing: list[str] = []
     for path in paths:
         with BagReader(path) as reader:
-            episodes += map(_report, episodes_in(reader, path, chosen))
-            missing += [*reader.missing, *reader.left_out]
+            episodes += map(_report, episodes_in(reader, as_text(path), chosen))
+            missing += map(as_text, (*reader.missing, *reader.left_out))
     return Report(tuple(episodes), tuple(missing))
 
 

@@ -17,7 +17,7 @@ from tdof_npid_ros.bag.salvage import SalvagedFile
 from tdof_npid_ros.bag.scan import Table
 from tdof_npid_ros.bag.storage import CDR_DEFINITIONS, TopicInfo
 from tdof_npid_ros.bag.writer import BagWriter
-from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.one_line import as_text, one_line
 
 RECORD: Final = "recovered"  # the metadata record that says so in the new bag
 
@@ -244,5 +244,5 @@ def recover(source: str | Path, destination: str | Path) -> RecoveryReport:
             (*missing, *recovery.missing),
             tuple(recovery.mended),
         )
-        writer.write_metadata(RECORD, {"source": str(source), "report": "\n".join(report.lines())})
+        writer.write_metadata(RECORD, {"source": as_text(source), "report": as_text("\n".join(report.lines()))})
     return report

@@ -16,6 +16,7 @@ from tdof_npid_ros.bag.errors import BagError
 from tdof_npid_ros.bag.file_writer import COMPRESSIONS, FileWriter
 from tdof_npid_ros.bag.qos import QosProfile, qos_text
 from tdof_npid_ros.bag.schema import ROS2MSG
+from tdof_npid_ros.one_line import as_text
 
 CHUNK_BYTES: Final = 1 << 20  # a chunk is compressed and written when it holds this much
 FLUSH_INTERVAL_S: Final = 0.5  # so that a crash loses less than a second, the writing itself included
@@ -259,7 +260,9 @@ class BagWriter:
             raise self._error from None
 
     def _open_file(self) -> None:
-        path = self.folder / f"{self.folder.resolve().name}_{len(self._finished)}.mcap"
+        name = self.folder.resolve().name
+        name = name if name == as_text(name) else "bag"  # metadata.yaml names the file, in UTF-8
+        path = self.folder / f"{name}_{len(self._finished)}.mcap"
         self._file = FileWriter(path, self._compression)
         for kind in self._schemas.values():
             self._file.add_schema(kind)

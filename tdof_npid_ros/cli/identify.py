@@ -13,6 +13,7 @@ from tdof_npid_ros.identification.identify import identify
 from tdof_npid_ros.identification.records import read_records
 from tdof_npid_ros.identification.result import as_json, draft_of, draw, table
 from tdof_npid_ros.identification.structures import STRUCTURES
+from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.output_file import OutputError, check_outputs
 from tdof_npid_ros.parameter_file import ParameterFileError
 from tdof_npid_ros.plants.plant import PlantError
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     records = read_records(arguments.bags, arguments.episode, choice(arguments))
     structures = [STRUCTURES[arguments.structure]] if arguments.structure else list(STRUCTURES.values())
     found = identify([record.stretch for record in records], structures)
-    title = f"Identified from {', '.join(Path(bag).name for bag in arguments.bags)}"
+    title = f"Identified from {', '.join(as_text(Path(bag).name) for bag in arguments.bags)}"
     try:
         draft = draft_of(found, records, title)
         text = draft.text()

@@ -10,6 +10,7 @@ from tdof_npid_ros.analysis.compare import Comparison
 from tdof_npid_ros.cli.choice import add_choice, choice
 from tdof_npid_ros.graph.replay_node import replay
 from tdof_npid_ros.names import in_namespace
+from tdof_npid_ros.parameter_file import for_ros
 from tdof_npid_ros.parameters import REPLAY
 
 
@@ -40,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     for role in ("output", "setpoint", "effort"):
         if (path := getattr(chosen, role)) is not None:
             parameters[role] = str(path)
+    for_ros(arguments.bag)
     namespace = in_namespace(arguments.namespace).rstrip("/") or "/"
     if not re.fullmatch(r"/|(/[A-Za-z_]\w*)+", namespace, re.ASCII):
         raise ValueError(

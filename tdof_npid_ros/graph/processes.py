@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from tdof_npid_ros.graph.__main__ import PARENT
-from tdof_npid_ros.parameter_file import read_parameters, write_parameters
+from tdof_npid_ros.parameter_file import for_ros, read_parameters, write_parameters
 
 STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
 
@@ -77,10 +77,10 @@ class NodeProcesses:
         file = self._parameter_file
         if parameters:  # one file: of a number in one file and a list in another, ROS takes the number
             values = {**read_parameters(file, node), **parameters}
-            plain = {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+            plain = {name: for_ros(value) if isinstance(value, str | Path) else value for name, value in values.items()}
             file = self._logs / f"{node}.yaml"
             write_parameters(file, {node: plain})
-        command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "--params-file", str(file)]
+        command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "--params-file", for_ros(file)]
         command += [word for name, other in self._names.items() for word in ("-r", f"{name}:={other}")]
         with self.log(node).open("wb") as log, _interrupted_afterwards():
             # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
