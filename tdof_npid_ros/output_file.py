@@ -87,4 +87,5 @@ def check_writable(path: Path) -> None:
             probe.flush()
             os.fsync(probe.fileno())
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+        why = error.strerror or "it is a pipe or the like: give a file"
+        raise OutputError(f"{path} cannot be written: {why}") from error

@@ -81,3 +81,9 @@ def test_ros_takes_text_alone_and_so_it_is_said() -> None:
     assert for_ros("größe") == "größe"
     with pytest.raises(ParameterFileError, match="ROS takes names in UTF-8 alone"):
         for_ros(Path(NAME))
+
+
+def test_a_pipe_is_no_place_for_a_result(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    status, told = called("simulate", "p3-c1", "--csv", str(tmp_path / "pipe"))
+    assert status == 2 and "pipe cannot be written: it is a pipe or the like: give a file" in told

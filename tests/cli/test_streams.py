@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "analysis"))
+from loop_bags import LoopBag
+
+from tdof_npid_ros.case import load_case
 from tdof_npid_ros.checkpoint import VERSIONS, CheckpointError, read_checkpoint, write_checkpoint
 
 PROGRAM = [sys.executable, "-m", "tdof_npid_ros"]
@@ -32,6 +37,33 @@ def test_a_result_is_written_whatever_becomes_of_the_streams(tmp_path: Path, str
     assert "kp:" in out.read_text()
     assert read_checkpoint(tmp_path / "c", "tuning")["optimizer"]
     assert b"Traceback" not in done.stderr
+
+
+ONE_AFTER_THE_OTHER = """
+import json, sys
+from tdof_npid_ros.streams import prepare_streams
+prepare_streams()  # as the console script does
+from tdof_npid_ros.cli import main
+sys.exit(max(main(command) for command in json.loads(sys.argv[1])))
+"""
+
+
+def test_every_subcommand_that_writes_files_does_so_without_streams(tmp_path: Path) -> None:
+    with LoopBag(tmp_path / "bag") as bag:
+        case = load_case("p3-c1")
+        bag.configuration(case, case.gains)
+        bag.episode(case, case.gains, "setpoint", 1)
+    written = [str(tmp_path / name) for name in ("s.csv", "m.png", "a.csv", "new", "n.yaml")]
+    commands = (
+        ["simulate", "p3-c1", "--csv", written[0]],
+        ["margins", "p3-c1", "--plot", written[1]],
+        ["analyze", str(tmp_path / "bag"), "--csv", written[2]],
+        ["recover", str(tmp_path / "bag"), written[3]],
+        ["new", written[4], "--gain", "1", "--time-constant", "1", "--step", "1"],
+    )
+    done = shell('"$@" <&- >&- 2>&-', sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(commands))
+    assert done.returncode == 0
+    assert all(Path(path).exists() for path in written)
 
 
 def test_a_full_standard_output_is_told_of_but_the_result_is_there(tmp_path: Path) -> None:
