@@ -102,12 +102,13 @@ class Dots:
 
 @dataclass(frozen=True)
 class Curve:
-    """A picture's line: seconds against size, both axes logarithmic."""
+    """A picture's line: seconds, or what `unit` says, against size, both axes logarithmic."""
 
     name: str
     size_unit: str
     sizes: list[float]
     seconds: list[float]
+    unit: str = "s"
 
 
 @dataclass
@@ -224,6 +225,18 @@ def machine() -> dict[str, Any]:
 def last_line(output: str) -> str:
     """What a program printed last: the middleware may have printed its own complaints before."""
     return output.strip().splitlines()[-1]
+
+
+def resident_mib(pid: int) -> float:
+    """Memory of a process that is in use, in MiB."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    return int(status.split("VmRSS:")[1].split()[0]) / 1024.0
+
+
+def processor_seconds(pid: int) -> float:
+    """Processor time that a process has had, in s."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _compiler() -> str:

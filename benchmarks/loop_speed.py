@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Rate, Result, Table, Verdict, main, plural, rate, summary
+from benchmarks.harness import Rate, Result, Table, Verdict, main, plural, rate, seconds, summary
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import coefficients, conditional_integration, limits_of
 from tdof_npid_ros.loop import integrals, simulate
+from tdof_npid_ros.plants.per_lane import lane_plants
+from tdof_npid_ros.plants.plant import PlantAt
 from tdof_npid_ros.scenario import SampledPlan, parse_plan
 
 TITLE = "Closed-loop steps per second"
@@ -33,7 +35,8 @@ METHOD = (
     "states as Numba compiles ours, no -ffast-math as ours has none; it is built with the C library's exponential and "
     "with ours, and the faster build counts. It is one lane; with as many lanes as ours, in gcc's vectors, it is "
     "measured, "
-    "too. python-control runs the whole loop as one discrete `nlsys` through `input_output_response`, which is "
+    "too. Lanes with a plant each have its gain and time constant, then its dead time, too, spread by 20 %. "
+    "python-control runs the whole loop as one discrete `nlsys` through `input_output_response`, which is "
     "several times "
     "faster than interconnected systems; bdsim (graphics and progress off) as one clocked state and one function; "
     "both step "
@@ -64,6 +67,7 @@ NOTES = (
 LINEAR = ("p1-c0.5", "p1-c4", "p2-c2", "p2-c5", "p3-c1", "p3-c2")
 CASE = "p1-c0.5"
 MANY = 64  # lanes
+SPREAD = ("gain", "time_constant", "dead_time")  # of the plants that differ
 UNLIMITED = (-math.inf, math.inf)
 C_SOURCE = Path(__file__).with_name("loop.c")
 C_BUILDS = {"C library's exp": (), "our exp": ("-DPOLYNOMIAL",)}
@@ -93,9 +97,10 @@ def run(size: str) -> Result:
         _against_c(result, per_case)
         fastest = max(rate.median for rate in c_many.values())
         claim = f"{MANY} lanes on one core, times C with {MANY} lanes, {CASE}"
-        result.verdicts.append(Verdict(claim, many.median / fastest, None))
+        result.verdicts.append(Verdict(claim, many.median / fastest, 1.0))
     else:
         result.notes.append("no C compiler on this machine: not compared with C")
+    _own_plants(result, case, steps // 16, repeats)
     slowest = min(per_case, key=lambda name: per_case[name][1].median)
     claim = f"million steps per second and core, {MANY} lanes, slowest linear case ({slowest})"
     result.verdicts.append(Verdict(claim, per_case[slowest][1].median / 1e6, 50.0))
@@ -162,6 +167,35 @@ def _ours(case: Case, lanes: int, steps: int, repeats: int) -> Rate:
         f"tdof_npid_ros, {plural(lanes, 'lane')}, one core", "steps/s", lanes * signals.steps,
         lambda: integrals(case.plant_at, gains, signals, UNLIMITED), repeats, ours=True,
     )  # fmt: skip
+
+
+def _own_plants(result: Result, case: Case, steps: int, repeats: int) -> None:
+    """Lanes with a plant of its own each beside lanes with one for all, in turn."""
+    signals, gains = _signals(case, steps), _lanes_of(case.gains, MANY)
+    spread = np.linspace(0.8, 1.2, MANY)
+    values = {name: float(value) for name, value in case.plant_values.items() if name in SPREAD}
+    own = [{name: value * factor for name, value in values.items()} for factor in spread]
+    same_delay = [{**one, "dead_time": values["dead_time"]} for one in own]
+    plants = {"one plant for all": None} | {
+        name: lane_plants([_plant_at(case, one) for one in lanes], signals, UNLIMITED)
+        for name, lanes in {"a plant each": same_delay, "a plant each, dead times too": own}.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in plants}
+    for round_ in range(1 + repeats):
+        for name, chosen in plants.items():
+            took = seconds(lambda chosen=chosen: integrals(chosen or case.plant_at, gains, signals, UNLIMITED))  # type: ignore[misc]
+            times[name] += [took] if round_ else []
+    for name, found in times.items():
+        rates = [MANY * signals.steps / time for time in found]
+        result.rates.append(summary(f"tdof_npid_ros, {MANY} lanes, {name}", "steps/s", rates, ours=True))
+        if name != "one plant for all":
+            ratios = [one / its for one, its in zip(times["one plant for all"], found, strict=True)]
+            claim = f"{MANY} lanes, {name}, times one plant for all"
+            result.verdicts.append(Verdict(claim, float(np.median(ratios)), 0.6))
+
+
+def _plant_at(case: Case, own: dict[str, float]) -> PlantAt:
+    return lambda changes: case.plant_at({**own, **changes})
 
 
 def _two_cores(case: Case, steps: int, repeats: int) -> Rate:

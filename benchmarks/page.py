@@ -207,7 +207,7 @@ def _draw_curve(axes: Any, curve: Curve) -> None:
     axes.loglog(curve.sizes, linear, "--", color="0.5", label="linear growth")
     axes.set_title(curve.name, fontsize=9)
     axes.set_xlabel(curve.size_unit, fontsize=8)
-    axes.set_ylabel("s", fontsize=8)
+    axes.set_ylabel(curve.unit, fontsize=8)
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

@@ -77,7 +77,7 @@ def run(size: str) -> Result:
             result.rates.append(summary(f"plant node at {name}, {percentile}", "us off", values, ours=True))
         ratios = [our["period_error_p99"] / its["period_error_p99"] for our, its in zip(ours, bare, strict=True)]
         claim = f"{name}: p99 of the period's error, times the bare timer's"
-        result.verdicts.append(Verdict(claim, statistics.median(ratios), 1.5, at_most=True))
+        result.verdicts.append(Verdict(claim, statistics.median(ratios), 1.2, at_most=True))
         answer = {p: [one[f"output_to_effort_{p}"] for one in ours] for p in ("p50", "p99")}
         result.notes.append(
             f"{name}: {ours[-1]['steps']:,.0f} ticks, {ours[-1]['missed_ticks']:,.0f} missed; output to effort p50 "

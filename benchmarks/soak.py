@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import Result, Verdict, main, ros_environment, summary
+from benchmarks.harness import Result, Verdict, main, resident_mib, ros_environment, summary
 
 TITLE = "Soak: ten minutes at 200 Hz"
 METHOD = (
@@ -69,30 +68,15 @@ def _watched(folder: Path, seconds: float) -> tuple[dict[str, list[float]], floa
         conductor = Conductor(NAMESPACE, nodes.check)
         try:
             conductor.wait(lambda: conductor.fact("plant", "output_to_effort_p50_us") != "", "the loop", TIMEOUT)
-            pids, start = _children(), time.monotonic()
+            pids, start = nodes.pids, time.monotonic()
             for second in range(round(seconds) + 1):
                 for node in NODES:
-                    memory[node].append(_resident(pids[node]))
+                    memory[node].append(resident_mib(pids[node]))
                 due = start + second + 1.0
                 conductor.wait(lambda due=due: time.monotonic() > due, "the next second", TIMEOUT)  # type: ignore[misc]
             return memory, float(conductor.fact("plant", "missed_ticks") or 0)
         finally:
             conductor.close()
-
-
-def _children() -> dict[str, int]:
-    """The nodes' processes, by node."""
-    found: dict[str, int] = {}
-    for children in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
-        for pid in map(int, children.read_text().split()):
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-            found |= {node: pid for node in NODES if node in words and "tdof_npid_ros.graph" in words}
-    return found
-
-
-def _resident(pid: int) -> float:
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.split("VmRSS:")[1].split()[0]) / 1024.0
 
 
 def _answers(bag: Path, warm_up: float) -> tuple[int, int]:

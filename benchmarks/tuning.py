@@ -251,9 +251,9 @@ def _state_evaluations(result: Result, runs: list[Run], rows: list[Row], names: 
     labels = [" ".join(row) for row in rows]
     result.verdicts += [
         Verdict("share of rows on which the HGA needs the fewest evaluations (median of the seeds)",
-                len(fewest) / len(rows), 0.5),
+                len(fewest) / len(rows), 0.9),
         Verdict("share of the HGA's runs that reach the "
-        "target", float(np.mean([shares["HGA", r] for r in rows])), 0.95),
+        "target", float(np.mean([shares["HGA", r] for r in rows])), 1.0),
         Verdict(f"the same on its weakest row ({' '.join(least)})", shares["HGA", least], None),
     ]  # fmt: skip
     for name in names:

@@ -97,6 +97,11 @@ class NodeProcesses:
         """Where a node's log is."""
         return self._logs / f"{node}.log"
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """The nodes' processes, by node."""
+        return {node: process.pid for node, process in self._processes.items()}
+
     def has_ended(self, node: str) -> bool:
         """Whether a node's process has ended."""
         return self._processes[node].poll() is not None
