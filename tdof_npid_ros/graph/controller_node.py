@@ -60,7 +60,6 @@ class ControllerNode(LoopEnd):
         if given["experiment"]:
             raise ValueError("experiment must be empty at the start: set it once the loop runs")
         self.stall_watch = StallWatch()
-        self.is_driven_off = False
         self._take_fields(given)
         self.commanded = False  # the topic gives the setpoint, since the activation
         self.checked(given)
@@ -106,6 +105,7 @@ class ControllerNode(LoopEnd):
         self.prepare_for_realtime()
         self.session.begin()
         self.stall_watch.forget()
+        self.is_driven_off = False
         self.why_refused = ""  # the latest output, if that was
         self.commanded = False
         self.session.holds_output = bool(self.values_of(["hold_output"])["hold_output"])
@@ -367,10 +367,14 @@ class ControllerNode(LoopEnd):
         return self.active and self.session.is_live and not self.session.silent
 
     def _look_for_stall(self) -> Stall | None:
-        """Whether the loop has been driven off; said once, with the time to expect where a file tells the plant."""
+        """Whether the loop has been driven off; said once, with the time to expect where a file tells the plant.
+
+        In lockstep, where a tuner tries many gains, only the first time.
+        """
         stall = self.stall_watch.look(self.controller)
-        before, self.is_driven_off = self.is_driven_off, stall is not None
-        if stall is not None and not before:  # in a thread: the plant's file takes its time
+        is_new = stall is not None and not self.is_driven_off
+        self.is_driven_off = stall is not None or (self.is_driven_off and not self.session.is_live)
+        if stall is not None and is_new:  # in a thread: the plant's file takes its time
             threading.Thread(target=self._tell_of_stall, args=(stall, self.controller.gains), daemon=True).start()
         return stall
 
@@ -414,7 +418,8 @@ class ControllerNode(LoopEnd):
             return OK, one_line(f"experiment {session.guard.name} has the loop"), facts
         if (stall := self._look_for_stall()) is not None:
             facts |= {"k_of_error": stall.scale, "integral_rate": stall.rate, "error_in_sigma": stall.in_sigma}
-            return ERROR, DRIVEN_OFF, facts
+            if session.is_live:  # else a plan's end ends it
+                return ERROR, DRIVEN_OFF, facts
         if self.controller.options.manual:
             return OK, "in manual mode: set manual to false for the law", facts
         return OK, "running", facts
