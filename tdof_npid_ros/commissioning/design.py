@@ -15,10 +15,11 @@ from tdof_npid_ros.control.options import ControllerOptions
 from tdof_npid_ros.draft import Draft
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.excitation import relay_point
-from tdof_npid_ros.identification.identify import Identified
+from tdof_npid_ros.identification.identify import Identified, identify
 from tdof_npid_ros.identification.intervals import drawn
 from tdof_npid_ros.identification.records import Record
 from tdof_npid_ros.identification.result import draft_of
+from tdof_npid_ros.identification.structures import STRUCTURES
 from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.stability import StabilityError
 from tdof_npid_ros.stability.margins import Margins, margins
@@ -27,6 +28,8 @@ from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
 from tdof_npid_ros.tuning.study import Study
 
+FEW = 3  # parameters
+EXPLAINS = 80.0  # per cent, on data not used
 DRAWN = 40  # plants
 ALLOWED = 1.1  # times M_s - 1 asked for: what the worst of the plants drawn may have
 RELAY_AGREES = 1.3  # factor between the gain that a relay tells and the model's
@@ -70,6 +73,27 @@ class Design:
     def horizon(self) -> float:
         """s in which the loop has settled after a step."""
         return self.case.signals["setpoint"].steps * self.case.sample_period
+
+
+def identified(records: Sequence[Record]) -> Identified:
+    """The plant that made some records. Where they do not tell the parameters of the structure that fits best, the
+    best of few parameters will do, if it explains them; whether it is good enough the confirming step shows.
+
+    Raises:
+        IdentificationError: they cannot tell.
+    """
+    stretches = [record.stretch for record in records]
+    try:
+        return identify(stretches)
+    except IdentificationError as error:
+        few = [structure for structure in STRUCTURES.values() if structure.parameters <= FEW]
+        try:
+            found = identify(stretches, few)
+        except IdentificationError:
+            raise error from None
+        if found.fit_percent < EXPLAINS:
+            raise
+        return found
 
 
 def designed(

@@ -23,6 +23,7 @@ LEAST_SAMPLES = 40  # of a level
 SETTLED = 0.05  # of what a level has moved: a smaller drift between its last two thirds is none
 IN_NOISE = 4.0  # standard deviations of a mean: the same
 MOVED = 5.0  # times the noise: the output has moved
+OUT_OF_NOISE = 30.0  # standard deviations: what the output is moved by at the least
 SAFE = 4.0  # times the output's move: what is safe where nobody says it
 EFFORT_FRACTION = 0.1  # of the actuator's range: how far an experiment by hand moves the effort
 LOOKS = 1.03  # a level is looked at anew when it is so many times longer
@@ -203,7 +204,7 @@ def proposed(
         ValueError: nothing tells how large it may be, or there is no room.
     """
     room = [abs(end - rest.output) for end in safe_output]
-    swing = max(20.0 * rest.noise, 0.2 * scale) * times
+    swing = max(OUT_OF_NOISE * rest.noise, 0.2 * scale) * times
     swing = min(swing, 0.5 * max(room))
     if by == "setpoint":
         size = math.copysign(swing, room[1] - room[0] if min(room) < 2.0 * swing else 1.0) if size is None else size
