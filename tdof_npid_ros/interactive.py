@@ -17,7 +17,8 @@ from tdof_npid_ros.plotting import GUIDE, PALETTE, Panel, PlottingError, effort_
 
 MOST_POINTS = 20_000  # of a curve; longer ones are thinned to the least and the largest value of each stretch
 DASHES = ("solid", "dashed", "dashdot", "dotted", [10, 3], [3, 2], [8, 2, 2, 2])
-LEGEND_COLUMNS = 3  # narrow enough for a phone
+LEGEND_COLUMNS, LEGEND_LETTERS = 3, 36  # most of a legend's columns, and of letters in a line: fits a phone
+LEGEND_LINE = 16  # pixels
 INK = "#808080"  # of axes and labels: readable on light and on dark
 DARK = """
 @media (prefers-color-scheme: dark) {
@@ -45,6 +46,8 @@ TABLES = """
 .table { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 14px; }
 th, td { padding: .25rem .7rem; text-align: left; border-bottom: 1px solid var(--grid); white-space: nowrap; }
 .number { text-align: right; }
+@media (max-width: 600px) { table { font-size: 12px; } th, td { padding: .2rem .3rem; white-space: normal; }
+  }
 """
 CSS = (
     TABLES
@@ -138,10 +141,15 @@ def table_html(rows: Sequence[Sequence[str]]) -> str:
     def line(cells: Sequence[str], tag: str) -> str:
         classes = (' class="number"' if is_number else "" for is_number in numeric)
         pairs = zip(cells, classes, strict=True)
-        return "<tr>" + "".join(f"<{tag}{class_}>{html.escape(cell)}</{tag}>" for cell, class_ in pairs) + "</tr>"
+        return "<tr>" + "".join(f"<{tag}{class_}>{_breakable(cell)}</{tag}>" for cell, class_ in pairs) + "</tr>"
 
     body = "".join(line(row, "td") for row in rows[1:])
     return f'<div class="table"><table><thead>{line(rows[0], "th")}</thead><tbody>{body}</tbody></table></div>'
+
+
+def _breakable(text: str) -> str:
+    """A cell's text, which a narrow screen may break after an underscore, too."""
+    return html.escape(text).replace("_", "_<wbr>")
 
 
 def fit_to_screen(document: Any) -> None:
@@ -218,8 +226,11 @@ def finish_legend(plot: Any) -> None:
         legend.background_fill_color = legend.border_line_color = None
         legend.label_text_color = INK
         legend.label_text_font_size = "12px"
-        legend.padding, legend.margin, legend.spacing = 0, 4, 12
-        legend.location, legend.ncols = "left", LEGEND_COLUMNS
+        legend.padding, legend.margin, legend.spacing = 0, 4, 8
+        legend.glyph_height = legend.label_height = LEGEND_LINE
+        longest = max((len(str(item.label.value)) for item in legend.items), default=0)
+        legend.location, legend.ncols = "left", max(1, min(LEGEND_COLUMNS, LEGEND_LETTERS // max(longest, 1)))
+        plot.height += (LEGEND_LINE + legend.spacing) * -(-len(legend.items) // legend.ncols)
     if plot.legend:
         plot.add_layout(plot.legend[0], "above")
 

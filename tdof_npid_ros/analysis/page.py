@@ -26,7 +26,9 @@ def write(episodes: Sequence[Named], table: Sequence[Sequence[str]], notes: Sequ
     page.table(table)
     for note in notes:
         page.text(note)
-    page.text("Drag to move, wheel or pinch to zoom in time, the arrow back for the whole; a click on a name hides it.")
+    page.text(
+        "Drag to move, Ctrl and wheel or pinch to zoom, the arrow back for the whole; a click on a name hides it."
+    )
     for group, members in grouped(episodes).items():
         page.heading(group)
         page.plot(*response_plots(panel(group, members, bags, {})))

@@ -12,7 +12,7 @@ from tdof_npid_ros.control.law import limits_of
 from tdof_npid_ros.plotting import Curve, Panel, draw_responses
 
 MOST_COLUMNS = 6
-MOST_LANES = 4  # of an episode
+MOST_LANES = 7  # of an episode: as many as there are colours
 Named = tuple[str, Episode]
 
 

@@ -24,7 +24,7 @@ from tdof_npid_ros.plants.catalog import model_parameters
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
 from tdof_npid_ros.stability.margins import Margins
 
-LANES_SHOWN = 4  # of an episode, in tables for people; JSON and CSV hold all
+LANES_SHOWN = 7  # of an episode, in tables for people, as many as there are colours; JSON and CSV hold all
 # Column of the table and of the CSV: title, and how a person reads a value.
 COLUMNS: Final[dict[str, tuple[str, Callable[[Any], str]]]] = {
     "bag": ("bag", "{}".format),

@@ -55,7 +55,7 @@ def test_a_step_is_shown_within_200_ms(tmp_path: Path) -> None:
         assert CHROMIUM
         with chromium_page(CHROMIUM) as page:
             page.goto(program.url, timeout=60_000)
-            page.wait_for_function("window.Bokeh && Bokeh.documents.length", timeout=60_000)
+            page.wait_for_function("window.Bokeh && Bokeh.documents[0]?.is_idle", timeout=60_000)
             page.evaluate(WATCH)
             eventually(lambda: run(0.1, 0.0) or page.evaluate("0 in window.seen"), "the loop is seen")
             late: list[list[float]] = []

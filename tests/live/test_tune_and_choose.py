@@ -55,10 +55,11 @@ def test_one_of_several_loops_and_lanes_is_chosen_and_a_joined_loop_outlives_the
         assert CHROMIUM
         with chromium_page(CHROMIUM) as page:
             page.goto(guest.url, timeout=60_000)
-            page.wait_for_function("window.Bokeh && Bokeh.documents.length", timeout=60_000)
+            page.wait_for_function("window.Bokeh && Bokeh.documents[0]?.is_idle", timeout=60_000)
             assert model(page, "loop", "w.options") == ["/nobody", "/live"]
             model(page, "loop", "w.value = '/live'")
-            eventually(lambda: model(page, "lane", "w.visible") and model(page, "kp_field", "w.value") == 2.0, "lane 0")
+            shown = lambda: [model(page, name, "w.value") for name in ("loop", "lane", "kp_field", "type")]  # noqa: E731
+            eventually(lambda: model(page, "lane", "w.visible") and shown()[2] == 2.0, shown)
             assert model(page, "kd", "w.pretty ? w.pretty(w.value) : w.value <= w.start")  # 0 has its place below
             model(page, "lane", "w.value = '1'")
             eventually(lambda: model(page, "kp_field", "w.value") == 1.0, "lane 1's kp")
