@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -81,6 +82,24 @@ def test_the_program_finds_the_cases_of_an_installed_tree(installed: Path) -> No
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert '"case": "p1-c4"' in done.stdout
+
+
+def test_a_source_distribution_is_whole_and_passes_twine(tmp_path: Path) -> None:
+    pytest.importorskip("twine", reason="twine is not installed: pip install -e '.[test]'")
+    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
+    command += ["sdist", "--dist-dir", str(tmp_path)]
+    made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    for folder in ("config", "launch", "examples", "examples/arm"):
+        files = [f"{folder}/{path.name}" for path in (ROOT / folder).iterdir() if path.is_file()]
+        assert files and set(files) <= names, folder
+    checked = subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", str(archive)], capture_output=True, text=True
+    )
+    assert checked.returncode == 0, checked.stdout
 
 
 def test_pip_installs_ros_only_when_asked() -> None:
