@@ -22,7 +22,7 @@ from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.wire import EpisodeLabel
 
-POLL = 0.02  # s
+POLL = 0.02  # s between two looks at what is waited for
 FOUND = 3.0  # s in which a new publisher is found by those who listen
 
 

@@ -22,7 +22,7 @@ from rclpy.node import Node
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains
-from tdof_npid_ros.graph.conductor import Conductor, LoopError
+from tdof_npid_ros.graph.conductor import POLL, Conductor, LoopError
 from tdof_npid_ros.graph.processes import NodeProcesses
 from tdof_npid_ros.graph.runtime.middleware import stay_on_this_machine
 from tdof_npid_ros.names import meant_hint
@@ -37,7 +37,6 @@ OF_A_LOOP = ("plant", "controller", "scenario")
 END_BY_THEMSELVES = ("tuner", "replay")
 START_TIMEOUT = 60.0  # s; the first start compiles
 STANDS_STILL = 20.0  # s without a step of the plant until nothing is waited for any longer
-POLL = 0.05  # s
 GIVEN = ("setpoint", "disturbance", "manual_effort")  # what a script may publish, where no scenario does
 # Who publishes a topic of the loop, and who takes it; a recorder comes to what is published.
 TOPICS = {

@@ -92,8 +92,9 @@ class LiveTuner:
         self, which: TuningProblem, loops: list[str], loop_timeout: float = 60.0, answer_timeout: float = 1.5
     ) -> Any:
         from tdof_npid_ros.graph.tuner.loop_pool import LoopPool
+        from tdof_npid_ros.graph.tuner.patience import Patience
 
-        pool = LoopPool(self.node, which, loops, loop_timeout, answer_timeout, lambda: None)
+        pool = LoopPool(self.node, which, loops, Patience(loop_timeout, answer_timeout, lambda: None))
         self._pools.append(pool)
         return pool
 
@@ -393,6 +394,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     from sensor_msgs.msg import JointState
 
     from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
+    from tdof_npid_ros.graph.tuner.patience import Patience
     from tdof_npid_ros.tuning.alternate import StepTest
 
     coarse = {"sample_period": 0.05, "mode": "realtime"}
@@ -404,7 +406,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     case = replace(short("p1-c0.5"), bounds=bounds)
     which = TuningProblem(case, "pid", seed=15, population=4, generations=2, polish=2)
     test = StepTest((0.0, 1.0), 0.1, 1.0, 25.0, (-1.0, 2.0), (-40.0, 40.0))
-    loop = AlternateLoop(tuner.node, which, test, "/real", 60.0, 5.0, lambda: None)
+    loop = AlternateLoop(tuner.node, which, test, "/real", Patience(60.0, 5.0, lambda: None))
     study = Study(which)
     loops.publisher("/real/output", JointState).publish(JointState())  # malformed; nobody stumbles over it
     run = threading.Thread(

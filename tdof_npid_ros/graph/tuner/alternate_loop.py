@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
 from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
+from tdof_npid_ros.graph.tuner.patience import POLL, Patience
 from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
@@ -22,8 +22,6 @@ from tdof_npid_ros.tuning.alternate import Settling, StepTest, Trial
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.live import LoopLostError
 from tdof_npid_ros.tuning.problem import TuningProblem
-
-POLL = 0.02  # s between two looks at a trial
 
 
 class AlternateLoop:
@@ -39,9 +37,7 @@ class AlternateLoop:
         problem: what is tuned.
         test: how.
         namespace: of the loop.
-        loop_timeout: s to wait for the loop at the start.
-        answer_timeout: s until a silent loop counts as lost.
-        check: called while waiting; raises to give up.
+        patience: with which it is waited for.
     """
 
     def __init__(
@@ -50,18 +46,15 @@ class AlternateLoop:
         problem: TuningProblem,
         test: StepTest,
         namespace: str,
-        loop_timeout: float,
-        answer_timeout: float,
-        check: Callable[[], None],
+        patience: Patience,
     ) -> None:
         self._node = node
         self._problem = problem
         self._test = test
         self._namespace = namespace
-        self._loop_timeout = loop_timeout
-        self._answer_timeout = answer_timeout
-        self._check = check
-        self._controller = TunedNode(node, in_namespace(namespace, "controller"), answer_timeout, check)
+        self._patience = patience
+        name = in_namespace(namespace, "controller")
+        self._controller = TunedNode(node, name, patience.for_an_answer, patience.check)
         self._good: Gains | None = None
         self._best = float("inf")
         self._level = test.levels[0]
@@ -125,11 +118,13 @@ class AlternateLoop:
     # A candidate
 
     def _begin(self) -> None:
-        end = time.monotonic() + self._loop_timeout
+        end = time.monotonic() + self._patience.for_a_loop
         while not self._outputs:
-            self._check()
+            self._patience.check()
             if time.monotonic() > end:
-                raise TuningError(f"no loop to tune: no output in {self._namespace} within {self._loop_timeout:g} s")
+                raise TuningError(
+                    f"no loop to tune: no output in {self._namespace} within {self._patience.for_a_loop:g} s"
+                )
             time.sleep(POLL)
         self._good = gains_from_mapping(self._controller.parameters(GAIN_NAMES))
         self._limits = self._good.integral_min, self._good.integral_max
@@ -205,11 +200,11 @@ class AlternateLoop:
         """Until what is watched has ended; raises LoopLostError if no outputs come any more."""
         seen, moved = self._outputs, self._now_ns
         while not self._ended.wait(POLL):
-            self._check()
+            self._patience.check()
             if self._outputs != seen:
                 seen, moved = self._outputs, self._now_ns
-            elif self._now_ns - moved > self._answer_timeout * 1e9:
-                raise LoopLostError(f"no output in {self._namespace} for {self._answer_timeout:g} s")
+            elif self._now_ns - moved > self._patience.for_an_answer * 1e9:
+                raise LoopLostError(f"no output in {self._namespace} for {self._patience.for_an_answer:g} s")
 
     @property
     def _now_ns(self) -> int:

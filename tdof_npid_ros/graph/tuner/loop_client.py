@@ -17,6 +17,7 @@ from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, Gains, gains_from_
 from tdof_npid_ros.graph.runtime.messages import plan_message
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.graph.runtime.tap import Taken, Tap, TapThread
+from tdof_npid_ros.graph.tuner.patience import POLL
 from tdof_npid_ros.graph.tuner.tuned_node import TunedNode
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.names import in_namespace
@@ -29,7 +30,6 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.wire import JOINT_STATE, EpisodeLabel, SignalReader
 
 ATTEMPTS = 5  # at an episode that something else cuts short
-POLL = 0.1  # s between two looks at an episode's progress
 TUNED_PARAMETERS = ("type", *PER_LANE)
 OUTPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -13,6 +13,7 @@ from rclpy.node import Node
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.graph.runtime.messages import node_of
 from tdof_npid_ros.graph.tuner.loop_client import LoopClient, WrongCaseError
+from tdof_npid_ros.graph.tuner.patience import POLL, Patience
 from tdof_npid_ros.names import in_namespace
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
@@ -21,7 +22,6 @@ from tdof_npid_ros.tuning.objective import scores
 from tdof_npid_ros.tuning.problem import TuningProblem
 
 OWN_LOOP, EVERY_LOOP = ".", "*"
-POLL = 0.05  # s between two looks for loops
 GATHERING = 2.5  # s at the start for all loops to be heard: two of their reports and a little
 
 
@@ -53,9 +53,7 @@ class LoopPool:
         node: through which everything goes; its executor spins in another thread.
         problem: what is tuned.
         loops: namespaces; `.` is the node's own, `*` every one that is heard.
-        loop_timeout: s without any loop until tuning gives up.
-        answer_timeout: s until a silent loop counts as lost.
-        check: called while waiting; raises to give up.
+        patience: with which they are waited for.
     """
 
     def __init__(
@@ -63,16 +61,12 @@ class LoopPool:
         node: Node,
         problem: TuningProblem,
         loops: Sequence[str],
-        loop_timeout: float,
-        answer_timeout: float,
-        check: Callable[[], None],
+        patience: Patience,
     ) -> None:
         self._node = node
         self._problem = problem
         self._finds_loops = EVERY_LOOP in loops
-        self._loop_timeout = loop_timeout
-        self._answer_timeout = answer_timeout
-        self._check = check
+        self._patience = patience
         self._heard: dict[str, float] = {}  # when each node was heard last (monotonic, s)
         self._gathered = 0.0  # when the tuning does not wait for further loops any more (monotonic, s)
         self._loops: dict[str, _Loop] = {}
@@ -119,15 +113,15 @@ class LoopPool:
 
     def _add(self, namespace: str) -> None:
         name = in_namespace(namespace).rstrip("/") or "/"
-        client = LoopClient(self._node, name, self._problem, self._answer_timeout, self._check)
+        client = LoopClient(self._node, name, self._problem, self._patience.for_an_answer, self._patience.check)
         self._loops[name] = _Loop(client)
 
     def _usable(self) -> list[LoopClient]:
         """The loops to use now; waits for one."""
-        end = time.monotonic() + self._loop_timeout
+        end = time.monotonic() + self._patience.for_a_loop
         self._gathered = self._gathered or time.monotonic() + GATHERING
         while True:
-            self._check()
+            self._patience.check()
             self._find()
             for namespace, loop in self._loops.items():
                 if loop.why_out and self._is_heard(namespace):

@@ -6,7 +6,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +21,7 @@ from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS
 from tdof_npid_ros.graph.runtime.run import Stop, run_node
 from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
 from tdof_npid_ros.graph.tuner.loop_pool import EVERY_LOOP, OWN_LOOP, LoopPool
+from tdof_npid_ros.graph.tuner.patience import POLL, Patience
 from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
@@ -31,7 +32,6 @@ from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
 from tdof_npid_ros.tuning.study import Study
 
-POLL = 0.05  # s between two looks for a signal
 FAILURE = 2  # exit status
 
 
@@ -95,13 +95,13 @@ class TunerNode(LoopNode):
         """Look for the loops, and let `run` begin."""
         self.progress = signal_message("")
         self.progress_publisher = self.create_publisher(JointState, "tuning_progress", LATCHED_QOS)
-        timeouts = self.loop_timeout, self.answer_timeout
+        patience = Patience(self.loop_timeout, self.answer_timeout, self.check_interrupted)
         self.evaluator: Evaluator
         if self.step_test is None:
-            self.evaluator = LoopPool(self, self.problem, self.loops, *timeouts, self.check_interrupted)
+            self.evaluator = LoopPool(self, self.problem, self.loops, patience)
         else:
             loop = self.get_namespace() if self.loops == [OWN_LOOP] else self.loops[0]
-            self.evaluator = AlternateLoop(self, self.problem, self.step_test, loop, *timeouts, self.check_interrupted)
+            self.evaluator = AlternateLoop(self, self.problem, self.step_test, loop, patience)
         self.activated.set()
 
     def deactivate(self) -> None:
@@ -152,7 +152,7 @@ class TunerNode(LoopNode):
             given["population"],
             given["generations"],
             given["polish"],
-            Constraints(**{one.name: given[one.name] or None for one in fields(Constraints)}),
+            Constraints.of_search(given),
             warm=given["start"] == "case",
             until_converged=given["until_converged"],
         )
