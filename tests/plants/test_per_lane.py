@@ -61,7 +61,6 @@ def varied(rng: np.random.Generator, nominal: Changes, lanes: int) -> list[Chang
     [
         ("first_order", {"gain": 1.5, "time_constant": 2.0, "dead_time": 0.105}),
         ("second_order", {"gain": 1.5, "time_constant": 0.5}),
-        ("third_order", {"time_constant": 0.4, "zero_time_constant": 0.1, "dead_time": 0.02}),
         ("first_order", {"dead_time": 0.1, "output_offset": 20.0, "effort_offset": 5.0}),
         ("sprott", {"a": 0.6, "b": 1.2, "c": 2.0}),
     ],
@@ -70,8 +69,9 @@ def test_each_lane_has_the_bits_of_its_plant_alone(model: str, nominal: Changes)
     changes = varied(np.random.default_rng(1), nominal, 5)
     if "dead_time" in nominal:
         changes[1]["dead_time"], changes[2]["dead_time"] = 0.0, 0.004  # none, and less than a sample
+    else:
+        check_each_lane(short({"model": model, **nominal}), changes[:1])
     check_each_lane(short({"model": model, **nominal}), changes)
-    check_each_lane(short({"model": model, **nominal}), changes[:1])
 
 
 def test_several_blocks_of_lanes_have_the_bits_of_each_alone() -> None:
