@@ -2,6 +2,6 @@
 
 MODULES = (
     "loop_speed", "tuning", "tuning_time", "test_functions", "lockstep", "live_tuning", "recorder", "writer",
-    "reader", "realtime", "startup", "memory", "growth", "fleet", "margins", "identification", "cluster",
+    "reader", "realtime", "startup", "memory", "growth", "fleet", "margins", "identification", "robust", "cluster",
 )  # fmt: skip
 LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only

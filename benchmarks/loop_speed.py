@@ -275,7 +275,7 @@ def _answer(case: Case) -> Callable[[float, float, float], tuple[float, float, f
     return answer
 
 
-def _vector_loop(case: Case) -> tuple[int, Callable[[np.ndarray], np.ndarray]]:
+def vector_loop(case: Case) -> tuple[int, Callable[[np.ndarray], np.ndarray]]:
     """The loop of Process 1 as a map of one vector: x, u_i, z, then the efforts in the dead time, newest first."""
     plant: Any = case.plant.sampled(case.sample_period_ns)
     answer, a, b = _answer(case), plant.phi[0][0], plant.gamma_new[0]
@@ -291,7 +291,7 @@ def _python_control(case: Case, seconds: float) -> Rate:
     """python-control: the whole loop as one discrete-time system."""
     import control
 
-    states, step = _vector_loop(case)
+    states, step = vector_loop(case)
     loop = control.nlsys(
         lambda t, x, u, p: step(x), lambda t, x, u, p: x[:1], inputs=1, outputs=1, states=states, dt=case.sample_period
     )
@@ -308,7 +308,7 @@ def _bdsim(case: Case, seconds: float) -> Rate:
     """bdsim: a clocked state and the function that gives its next value."""
     import bdsim
 
-    states, step = _vector_loop(case)
+    states, step = vector_loop(case)
     simulation = bdsim.BDSim(sysargs=False, toolboxes=False, graphics=False, progress=False, banner=False, quiet=True)
     diagram = simulation.blockdiagram()
     state = diagram.ZOH(diagram.clock(case.sample_period, unit="s"), x0=np.zeros(states))

@@ -45,7 +45,7 @@ def run(size: str) -> Result:
         tuning = _tuning_time(case, row, generations)
         found, of_margins = _timed(lambda case=case, gains=gains: margins(case, gains))
         _, of_certificate = _timed(lambda case=case, gains=gains: certify(case, gains))
-        theirs, of_peer = _timed(lambda case=case, gains=gains: _python_control(case, gains))
+        theirs, of_peer = _timed(lambda case=case, gains=gains: python_control_margins(case, gains))
         off = max(
             abs(theirs[name] / value - 1.0)
             for name, value in (("gm", found.gain_margin), ("pm", found.phase_margin_deg), ("ms", found.m_s))
@@ -100,7 +100,7 @@ def _tuning_time(case: Case, row: Published, generations: int) -> float:
     return seconds(lambda: Study(problem).run(objective))
 
 
-def _python_control(case: Case, gains: Gains) -> dict[str, float]:
+def python_control_margins(case: Case, gains: Gains) -> dict[str, float]:
     """Gain margin, phase margin in degrees and M_s of the sampled loop, NaN where it finds none."""
     import control
 

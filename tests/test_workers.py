@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,11 @@ from tdof_npid_ros.checkpoint import CheckpointError
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.plants.ode import loaded_class, take_class
 from tdof_npid_ros.plants.plant import PlantError
+from tdof_npid_ros.robustness.spread import spreads_of
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.perturbed import Perturbed
+from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.study import Study
 from tdof_npid_ros.workers import ChunkCheckpoint, WorkersError, workers
 
 pytestmark = pytest.mark.timeout(300)  # processes load the program anew
@@ -157,6 +163,19 @@ def test_fronts_found_on_a_cluster_are_those_found_here(cluster: Any, capsys: py
     here, there = capsys.readouterr().out.splitlines()
     assert here == there
     assert {point["controller"] for point in json.loads(here)["points"]} == {"npid", "pid"}
+
+
+def test_gains_tuned_for_many_plants_on_a_cluster_are_those_found_here(cluster: Any) -> None:
+    short = {"setpoint": ("0 setpoint 1", "3 end"), "disturbance": ("0 disturbance 1", "3 end")}
+    case = replace(load_case("p3-c1"), episodes=short)
+    plants = Perturbed(spreads_of(case, ["gain 20 %"]), 3)
+    problem = TuningProblem(case, "pid", population=6, generations=2, perturbed=plants)
+    with workers(cluster.scheduler_address) as there:
+        here, spread = Objective(problem), Objective(problem, where=there)
+        candidates = Study(problem).ask()
+        for one, other in zip(here.integrals(candidates), spread.integrals(candidates), strict=True):
+            assert one.iae.tobytes() == other.iae.tobytes()
+        assert here(candidates).values.tobytes() == spread(candidates).values.tobytes()
 
 
 def test_what_a_chunk_raises_is_raised_here(cluster: Any) -> None:

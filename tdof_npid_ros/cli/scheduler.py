@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 
-def add_scheduler_argument(parser: argparse.ArgumentParser) -> None:
+def add_scheduler_argument(parser: argparse._ActionsContainer) -> None:
     """Add it."""
     parser.add_argument(
         "--scheduler",

@@ -21,6 +21,7 @@ from tdof_npid_ros.advice import USUAL_M_S
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import INTERRUPTED
 from tdof_npid_ros.cli.robust import add_spread_argument
+from tdof_npid_ros.cli.scheduler import add_scheduler_argument
 from tdof_npid_ros.cli.simulate import (
     add_output_arguments,
     advised,
@@ -45,7 +46,7 @@ from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.perturbed import Perturbed
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study
-from tdof_npid_ros.workers import workers
+from tdof_npid_ros.workers import WorkersError, workers
 
 UNSEEN = 10_000  # other plants, for which robust gains are verified
 
@@ -96,6 +97,7 @@ def _add_robust_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="mean|worst|Q",
         help="what is minimised over the plants: the mean (default), the worst, or a quantile, as 0.9",
     )
+    add_scheduler_argument(group)
 
 
 def add_constraint_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,8 +128,16 @@ def run(arguments: argparse.Namespace) -> int:
         warnings.warn(f"{reason}, so no loop comes to rest in it and none is asked to", stacklevel=2)
     study = Study(problem, arguments.checkpoint, arguments.resume)
     started = time.monotonic()
-    with _interrupt_requested() as interrupted, _progress(study, shown=not arguments.json) as show:
-        study.run(Objective(problem), lambda study: show(study) or not interrupted())
+    with (
+        workers(arguments.scheduler) as where,
+        _interrupt_requested() as interrupted,
+        _progress(study, shown=not arguments.json) as show,
+    ):
+        objective = Objective(problem, where=where if arguments.scheduler else None)
+        try:
+            study.run(objective, lambda study: show(study) or not interrupted())
+        except WorkersError as error:
+            raise WorkersError(f"{error}, {_how_to_go_on(arguments)}") from None
     if not study.done:
         _say_interrupted(study, arguments)
         return INTERRUPTED
@@ -138,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
     report |= _search_report(study) | {"margins": found.as_dict()}
     report |= advised(problem.case, result.gains)
-    unseen = _unseen(problem, result.gains)
+    unseen = _unseen(problem, result.gains, arguments.scheduler)
     if unseen is not None:
         report |= {"robust": _robust_report(problem, result.objective, unseen)}
     if arguments.out:
@@ -151,13 +161,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _unseen(problem: TuningProblem, gains: Gains) -> RobustResult | None:
+def _unseen(problem: TuningProblem, gains: Gains, scheduler: str | None) -> RobustResult | None:
     """What the gains achieve on other plants of the spreads than they were tuned for."""
     if problem.perturbed is None:
         return None
-    with workers() as here:
+    with workers(scheduler) as where:
         seed = problem.perturbed.seed + 1
-        return sweep_plants(here, problem.case, gains, problem.perturbed.spreads, count=UNSEEN, seed=seed)
+        return sweep_plants(where, problem.case, gains, problem.perturbed.spreads, count=UNSEEN, seed=seed)
 
 
 def _robust_report(problem: TuningProblem, objective: float, unseen: RobustResult) -> dict[str, Any]:
@@ -237,6 +247,8 @@ def _perturbed(case: Case, arguments: argparse.Namespace) -> Perturbed | None:
     if arguments.robust is None:
         if arguments.spread or arguments.robust_by != "mean":
             raise TuningError("--spread and --robust-by are of the plants that --robust N tunes for: give it too")
+        if arguments.scheduler:
+            raise TuningError("--scheduler is for the many plants of --robust N: without them, threads are faster")
         return None
     by: str | float = arguments.robust_by
     if by not in ("mean", "worst"):
@@ -293,11 +305,14 @@ def _progress(study: Study, shown: bool) -> Iterator[Callable[[Study], None]]:
         yield show
 
 
+def _how_to_go_on(arguments: argparse.Namespace) -> str:
+    return "go on with --resume" if arguments.checkpoint else "nothing kept, for there is no --checkpoint"
+
+
 def _say_interrupted(study: Study, arguments: argparse.Namespace) -> None:
-    how = "go on with --resume" if arguments.checkpoint else "nothing kept, for there is no --checkpoint"
     print(
         f"tdof-npid tune: interrupted after {study.evaluations} of {study.budget} evaluations, "
-        f"{study.best_told}: {how}",
+        f"{study.best_told}: {_how_to_go_on(arguments)}",
         file=sys.stderr,
     )
 

@@ -7,16 +7,14 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 
 import numpy as np
 
 from tdof_npid_ros.control.gains import gains_from_candidates
 from tdof_npid_ros.loop import VECTOR, Integrals, joined
-from tdof_npid_ros.plants.per_lane import LanePlants
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
-from tdof_npid_ros.workers import available_cores
+from tdof_npid_ros.workers import Workers, available_cores
 
 LARGEST_IAE = 1e30
 """unit·s: an IAE above it is compressed; such a loop is useless, and only its place in the order matters."""
@@ -69,12 +67,13 @@ class Objective:
     They do not depend on the number of threads: lanes are independent, and each is summed in the order of time.
     """
 
-    def __init__(self, problem: TuningProblem, threads: int | None = None) -> None:
+    def __init__(self, problem: TuningProblem, threads: int | None = None, where: Workers | None = None) -> None:
         """
         Args:
             threads: by default one per core.
+            where: the loops with perturbed plants run; None: on those threads.
         """
-        self._problem = problem
+        self._problem, self._where = problem, where
         self._threads = threads or available_cores()
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="objective")
 
@@ -100,26 +99,22 @@ class Objective:
         return setpoint, disturbance
 
     def _integrals_of_plants(self, candidates: Array) -> tuple[Integrals, Integrals]:
-        problem = self._problem
-        parts = np.array_split(candidates, min(self._threads, len(candidates)))
+        problem, cores = self._problem, self._where.cores if self._where else self._threads
+        parts = np.array_split(candidates, min(cores, len(candidates)))
+        chunks = [(episode, part) for episode in EPISODES for part in parts]
+        if self._where:
+            found = self._where.map(integrals_of_plants, problem, chunks)
+        else:
+            _ = problem.plants  # before threads ask for them
+            found = list(self._pool.map(integrals_of_plants, [problem] * len(chunks), chunks))
+        return joined(found[: len(parts)]), joined(found[len(parts) :])
 
-        plants_of = self._plants  # before threads ask for them
 
-        def run(episode: str, part: Array) -> Integrals:
-            plants = plants_of[episode].with_each_of(len(part))
-            return problem.case.integrals(episode, gains_from_candidates(problem.base, problem.names, part), plants)
-
-        running = [[self._pool.submit(run, episode, part) for part in parts] for episode in EPISODES]
-        setpoint, disturbance = (joined([part.result() for part in episode]) for episode in running)
-        return setpoint, disturbance
-
-    @cached_property
-    def _plants(self) -> dict[str, LanePlants]:
-        """The perturbed plants, by episode."""
-        problem = self._problem
-        assert problem.perturbed is not None
-        changes = problem.perturbed.changes(problem.case)
-        return {episode: problem.case.lane_plants(episode, changes) for episode in EPISODES}
+def integrals_of_plants(problem: TuningProblem, chunk: tuple[str, Array]) -> Integrals:
+    """Of an episode with candidates (n, len(problem.names)), each with all perturbed plants, (n * plants,)."""
+    episode, candidates = chunk
+    gains = gains_from_candidates(problem.base, problem.names, candidates)
+    return problem.case.integrals(episode, gains, problem.plants[episode].with_each_of(len(candidates)))
 
 
 def _blocks(lanes: int, threads: int) -> list[slice]:

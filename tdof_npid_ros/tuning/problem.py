@@ -13,6 +13,7 @@ from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains, GainsError
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameters import TUNER, WEIGHT
 from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.plants.per_lane import LanePlants
 from tdof_npid_ros.stability import StabilityError
 from tdof_npid_ros.stability.plant import loop_plant, operating_point
 from tdof_npid_ros.stability.screen import Screen
@@ -205,6 +206,12 @@ class TuningProblem:
         """Of which candidates may win with all perturbed plants."""
         assert self.perturbed is not None
         return PlantsJudge(self.perturbed, self.case, self.judge, linear=self.screen is not None)
+
+    @cached_property
+    def plants(self) -> dict[str, LanePlants]:
+        """The perturbed plants, by episode; none if there are no such."""
+        changes = self.perturbed.changes(self.case) if self.perturbed else []
+        return {episode: self.case.lane_plants(episode, changes) for episode in EPISODES if changes}
 
     @cached_property
     def restless(self) -> dict[str, str]:

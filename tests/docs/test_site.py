@@ -85,3 +85,9 @@ def test_importing_the_package_loads_neither_numpy_nor_numba() -> None:
 def test_each_public_name_is_documented(name: str) -> None:
     assert getattr(tdof_npid_ros, name).__doc__
     assert name in (DOCS / "python.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("node", ["scenario_node", "recorder.node"])
+def test_a_node_that_computes_nothing_does_without_numba(node: str) -> None:
+    code = f"import sys, tdof_npid_ros.graph.{node}; sys.exit(bool({{'numba', 'scipy', 'mpmath'}} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
