@@ -72,14 +72,14 @@ LOOPS = {
          "noise": 0.1},
         (0.6, 0.02), 70.0, (30.0, 110.0), 15.0, PER_CENT,
     ),
-    "lag dominant": Loop(first(2.0, 60.0, 2.0, noise=0.002), (2.0, 0.05), 0.0, (-3.0, 3.0), 1.0),
+    "lag dominant": Loop(first(2.0, 60.0, 2.0, noise=0.002), (2.0, 0.05), 0.0, (-3.0, 3.0), 1.0, speed=40.0),
     "dead time dominant": Loop(first(1.0, 5.0, 15.0, noise=0.005), (0.1, 0.02), 0.0, (-3.0, 3.0), 1.0),
     "motor": Loop(transfer([1.5], [2.0, 1.0, 0.0], quantum=0.001), (0.2, 0.01), 0.0, (-3.0, 3.0), 1.0,
                   (-12.0, 12.0)),
     "integrator": Loop(transfer([0.05], [1.0, 0.0], 4.0, noise=0.005), (1.0, 0.01), 0.0, (-3.0, 3.0), 1.0),
     "level by hand": Loop(
         transfer([0.002], [1.0, 0.0], 2.0, noise=0.002, effort_offset=40.0), (20.0, 0.2), 1.0, (0.2, 2.5), 0.5,
-        PER_CENT, by_hand=True,
+        PER_CENT, speed=40.0, by_hand=True,
     ),
     "tank": Loop({"model": "commissioned_plants:Tank", "noise": 0.002}, (40.0, 2.0), 1.0, (0.4, 1.8), 0.2, PER_CENT),
     "inverse response": Loop(
