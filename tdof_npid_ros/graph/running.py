@@ -253,7 +253,8 @@ def run(
         try:
             if "scenario" not in nodes:
                 conductor.prepare_to_publish(*GIVEN)
-            conductor.wait_for_subscriptions(_subscribers(nodes, remap or {}, folder is not None), START_TIMEOUT)
+            counts = _subscribers(nodes, remap or {}, folder is not None, _mode(path, given))
+            conductor.wait_for_subscriptions(counts, START_TIMEOUT)
             yield RunningLoop(loaded, conductor, processes, folder)
         finally:
             conductor.close()
@@ -284,8 +285,7 @@ def start_nodes(
     """
     if bag is not None:
         new_folder(bag)
-    mode = given.get("mode") or read_parameters(path, "plant").get("mode", MODE.default)
-    lossless = {"lossless": True} if bag is not None and mode == "lockstep" and "plant" in nodes else {}
+    lossless = {"lossless": True} if bag is not None and _mode(path, given) == "lockstep" and "plant" in nodes else {}
     own: dict[str, dict[str, Any]] = {
         "recorder": {"bag": bag, **lossless},
         "plant": dict(lossless),
@@ -297,12 +297,20 @@ def start_nodes(
         processes.start(node, own.get(node, {}) | parameters[node])
 
 
-def _subscribers(nodes: Collection[str], remap: Mapping[str, str], recorded: bool) -> dict[str, int]:
-    """How many subscribers each topic has in a loop of these nodes that is ready."""
-    return {
-        remap.get(topic, topic): sum(node in nodes for node in takers) + (recorded and publisher in nodes)
-        for topic, (publisher, takers) in TOPICS.items()
-    }
+def _mode(path: Path, given: Mapping[str, Any]) -> str:
+    """How the loop runs: as asked for, or as the file says."""
+    return str(given.get("mode") or read_parameters(path, "plant").get("mode", MODE.default))
+
+
+def _subscribers(nodes: Collection[str], remap: Mapping[str, str], recorded: bool, mode: str) -> dict[str, int]:
+    """How many subscribers each topic has in a loop of these nodes that is ready; a plant in realtime takes no plan."""
+    found = {}
+    for topic, (publisher, takers) in TOPICS.items():
+        there = [node for node in takers if node in nodes]
+        if topic == "scenario_plan" and mode == "realtime":
+            there = [node for node in there if node != "plant"]
+        found[remap.get(topic, topic)] = len(there) + (recorded and publisher in nodes)
+    return found
 
 
 def _by_node(case: Case, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
