@@ -44,8 +44,9 @@ from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.perturbed import Perturbed
+from tdof_npid_ros.tuning.price import price_of_ms
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
-from tdof_npid_ros.tuning.study import Study
+from tdof_npid_ros.tuning.study import Study, TuningResult
 from tdof_npid_ros.workers import WorkersError, workers
 
 UNSEEN = 10_000  # other plants, for which robust gains are verified
@@ -146,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = margins(problem.case, result.gains)
     report = response_report(problem.case, result.gains)
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
-    report |= _search_report(study) | {"margins": found.as_dict()}
+    report |= _search_report(study) | {"margins": found.as_dict(), "price": _price(problem, result, found)}
     report |= advised(problem.case, result.gains)
     unseen = _unseen(problem, result.gains, arguments.scheduler)
     if unseen is not None:
@@ -336,7 +337,7 @@ def _summary(report: dict[str, Any], found: Margins) -> str:
             f"  setpoint: overshoot {setpoint['overshoot_percent']:.2f} %, IAE {in_units(setpoint['iae'])}",
             f"  disturbance: peak {in_units(disturbance['peak'])}, IAE {in_units(disturbance['iae'])}",
             *(f"  {line}" for line in found.lines()),
-            *([f"  M_s is above {USUAL_M_S:g}: --ms 1.8 finds gains with more room"] if _is_near(found) else []),
+            *([f"  {_warning(report)}"] if _is_near(found) else []),
             f"  {report['evaluations']} evaluations in {report['elapsed_s']:.1f} s, from {began}{ended}{saved}",
         ]
     )
@@ -345,6 +346,25 @@ def _summary(report: dict[str, Any], found: Margins) -> str:
 def _is_near(found: Margins) -> bool:
     """Whether the loop is nearer to instability than is usual."""
     return found.m_s is not None and found.m_s > 1.01 * USUAL_M_S
+
+
+def _price(problem: TuningProblem, result: TuningResult, found: Margins) -> dict[str, float] | None:
+    """What it costs to keep M_s within what is usual; None where it is, or was asked for, or nothing was found."""
+    asked = problem.constraints.ms
+    held = price_of_ms(problem, result.gains, USUAL_M_S) if _is_near(found) and asked is None else None
+    if held is None:
+        return None
+    return {
+        "ms": USUAL_M_S,
+        "objective": held.objective,
+        "percent": 100.0 * (held.objective / result.objective - 1.0),
+    }
+
+
+def _warning(report: dict[str, Any]) -> str:
+    price = report["price"]
+    near = f"M_s is above {USUAL_M_S:g}, nearer to instability than is usual: --ms {USUAL_M_S:g} keeps away from it"
+    return near + (f", objective {price['objective']:.6g} ({price['percent']:+.1f} %)" if price else "")
 
 
 def _compared(problem: TuningProblem, tuned: Gains) -> dict[str, Gains]:

@@ -12,9 +12,9 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
-from tdof_npid_ros.control.gains import CONTROLLER_TYPES, TUNED
+from tdof_npid_ros.control.gains import CONTROLLER_TYPES, TUNED, ControllerType
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.pareto import Front, dominated_fraction, foptd_case, pareto_front
+from tdof_npid_ros.tuning.pareto import POORER, Front, dominated_fraction, foptd_case, pareto_front
 
 RATIO = 0.5
 SHORT = ["pareto", "--ratio", "0.5", "--generations", "3"]
@@ -55,6 +55,18 @@ def test_the_paper_s_order_of_the_controllers(fronts: dict[str, Front]) -> None:
     least = {kind: front.iae.sum(axis=1).min() for kind, front in fronts.items()}
     assert least["tdof_npid2"] < least["npid"] < least["pid"]
     assert least["tdof_npid2"] == pytest.approx(least["tdof_npid1"], rel=0.02)
+
+
+@pytest.mark.parametrize("kind", sorted(POORER))
+def test_a_controller_is_nowhere_behind_the_one_that_it_contains(kind: ControllerType) -> None:
+    """Not at the ends, either: each point of the poorer front has one of the richer that is as good in both measures.
+
+    NSGA-II gets hardly any generations here, so that it cannot be its doing.
+    """
+    poorer = pareto_front(0.1, POORER[kind], population=16, generations=2)
+    richer = pareto_front(0.1, kind, population=16, generations=2, poorer=poorer)
+    assert all((richer.iae <= point).all(axis=1).any() for point in poorer.iae)
+    assert (richer.iae.min(axis=0) <= poorer.iae.min(axis=0)).all()
 
 
 def test_a_weight_moves_the_best_point(fronts: dict[str, Front]) -> None:

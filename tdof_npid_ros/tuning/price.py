@@ -1,0 +1,33 @@
+"""The price of robustness: what the objective becomes when the loop must keep away from instability."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.tuning.objective import Objective
+from tdof_npid_ros.tuning.problem import GENERATIONS, TuningProblem
+from tdof_npid_ros.tuning.study import Study, TuningResult
+
+FRACTION = 4
+"""Of a search's generations, one in so many is spent on the price, and of the usual search's at the most."""
+
+
+def price_of_ms(problem: TuningProblem, gains: Gains, ms: float) -> TuningResult | None:
+    """What a short search finds, from these gains, with M_s held to `ms`; None if it finds nothing allowed.
+
+    Args:
+        problem: the one that the gains were found for, with a linear model.
+        gains: of the problem's controller.
+    """
+    held = replace(
+        problem,
+        case=replace(problem.case, gains=gains),
+        generations=max(1, min(problem.generations, GENERATIONS) // FRACTION),
+        constraints=replace(problem.constraints, ms=ms),
+        warm=True,
+        until_converged=True,
+    )
+    study = Study(held)
+    study.run(Objective(held))
+    return study.result if study.feasible else None
