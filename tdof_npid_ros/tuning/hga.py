@@ -12,15 +12,22 @@ That finds the valley of a good controller in a generation or two and then creep
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
 and asks for the model's minimum and for samples about it, shaped like the cloud of kept points. When that has
 stalled, the round is over, and another begins from a new random population, dense at the bounds, and polishes more
-patiently, until the budget is spent. A round whose points agree already, but in a valley that lies higher than the best
-is given up. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
+patiently, until the budget is spent. A round whose points agree already, but in a valley higher than the best,
+is given up, and so is one whose best points gather where an earlier round ended. After a round that has found a better
+best, the next one begins about it, near and far: a narrow valley is walked in more than one round. Every candidate
+counts as an evaluation. `polish=0` is the paper's HGA alone.
+
+Half of each random population is drawn along the parameters' scales, half of it linearly: bounds that fit lie about
+the gains, bounds that are decades wide do not.
+
+A large polish asks for several minima of the model at once, within small and large distances of the best point.
 
 What is not allowed never wins, but it is not thrown away: the best gains lie where a constraint just holds, and the
 model must see both sides of that. So points are kept and fitted by their *merit*, f + penalty · violation · |f|. Where
 a round ends at a point that is not allowed, the next one has a larger penalty. Until something allowed has been found,
 the violation alone is the merit.
 
-A run has *converged* when enough rounds are over and more than one of them has ended as low as the best.
+A run has *converged* when enough rounds are over and more than one that began anywhere has ended as low as the best.
 
 A run is the same on every machine: NumPy's PCG64 drawn only for uniform numbers, elementwise arithmetic, decimal
 powers, no BLAS and no math library.
@@ -50,6 +57,9 @@ KEPT_PER_COEFFICIENT = (2.5, 3.5, 6.0)
 TRUST_RADIUS = 1.5
 """How far from the best point the model is believed, in standard deviations of the kept points."""
 
+RADII, GROUP = (1.0, 2.0, 4.0, 0.5), 8
+"""Of a large polish each group of so many candidates has its own radius, in TRUST_RADIUS: far steps along a valley."""
+
 SAMPLE_SPREAD = 0.6
 """Standard deviation of the samples, in those of the kept points; well below 1, so that the cloud shrinks."""
 
@@ -62,6 +72,9 @@ PROGRESS, PATIENCE = 1e-4, 3.0
 HIGHER = 4.0
 """A round is given up when its best point lies higher than the run's by so many times median - best of its points."""
 
+SAME_VALLEY = 0.1
+"""A round is given up when the best quarter of its points is no farther than this from where another one ended."""
+
 PENALTY, STIFFER = 3.0, 4.0
 """Of the merit: at first, and by which factor it grows."""
 
@@ -69,7 +82,7 @@ TIE = 1e-3
 """How much the objective counts beside a violation, while nothing allowed has been found: less than this."""
 
 ROUNDS_TO_CONVERGE, CONFIRMATIONS = 5, 2
-"""Rounds that must be over, and those of them that must have ended as low as the best..."""
+"""Rounds that must be over, and those of them, begun anywhere, that must have ended as low as the best..."""
 
 CONFIRMED = 1e-3
 """... within this, relatively, before the run counts as converged."""
@@ -81,15 +94,20 @@ class HGAState(SearchState):
 
     Attributes:
         round: restarts so far.
+        about_best: whether this round began about the best of those before.
+        round_began_at: the best value when this round began.
         age: generations told in this round.
         searching: whether nothing allowed has been found yet.
         points, objectives, violations: [m, d] in 0 .. 1, [m], [m]: the best points of this round, best merit first.
         goal: the merit below which this round counts as having made progress; `waited`: evaluations since.
         penalty: of the merit in this round.
-        ends: the lowest allowed values of the rounds that are over, of those that have one.
+        ends: the lowest allowed values of the rounds that began anywhere and are over; infinite where there is none.
+        end_points: [k, d], the different points where rounds ended, with something allowed, and end_values [k] there.
     """
 
     round: int = 0
+    about_best: bool = False
+    round_began_at: float = math.inf
     age: int = 0
     searching: bool = True
     points: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -99,10 +117,13 @@ class HGAState(SearchState):
     waited: int = 0
     penalty: float = PENALTY
     ends: Array = field(default_factory=lambda: np.empty(0))
+    end_points: Array = field(default_factory=lambda: np.empty((0, 0)))
+    end_values: Array = field(default_factory=lambda: np.empty(0))
 
 
 _COUNTS = ("evaluations", "generation", "round", "age", "waited")
-_NUMBERS = ("best_value", "best_violation", "goal", "penalty")
+_NUMBERS = ("best_value", "best_violation", "round_began_at", "goal", "penalty")
+_FLAGS = ("about_best", "searching")
 
 
 class HGA(Optimizer):
@@ -150,29 +171,72 @@ class HGA(Optimizer):
         self.seed, self.population, self.generations, self.polish = seed, population, generations, polish
         self.eta, self.mutation_rate, self.shape = eta, mutation_rate, shape
         self._random = np.random.Generator(np.random.PCG64(seed))
-        self._state = HGAState(self._with_starts(self._random.random((population, self.dimension))))
+        uniform = self._random.random((population, self.dimension))
+        self._state = HGAState(self._with_starts(self._half_linear(uniform)), end_points=np.empty((0, self.dimension)))
         self._forget()
 
     @property
     def converged(self) -> bool:
-        """Whether `ROUNDS_TO_CONVERGE` rounds are over and `CONFIRMATIONS` of them ended as low as the best."""
+        """Whether `ROUNDS_TO_CONVERGE` rounds are over, and `CONFIRMATIONS` begun anywhere ended as low as the best."""
         ends = self._state.ends
         as_low = int(np.count_nonzero(ends <= self.best_value + CONFIRMED * abs(self.best_value)))
-        return self.best_violation == 0.0 and len(ends) >= ROUNDS_TO_CONVERGE and as_low >= CONFIRMATIONS
+        return self.best_violation == 0.0 and self._state.round >= ROUNDS_TO_CONVERGE and as_low >= CONFIRMATIONS
 
     def _new_round(self) -> Array:
-        """End the round, forget all but the global best, and draw the next one's population, densely at the bounds.
+        """End the round, forget all but the global best, and draw the next one's population.
 
-        A valley that lies along a bound is often narrow, and a uniform population misses it.
+        About the best if the round has found it, at all distances. Otherwise anywhere, densely at the bounds: a valley
+        that lies along one is often narrow, and a uniform population misses it.
         """
         state = self._state
         if state.violations[0] > 0.0:
             state.penalty *= STIFFER
-        state.ends = np.append(state.ends, state.objectives[state.violations == 0.0].min(initial=math.inf))
+        self._note_end()
+        state.about_best = state.best_violation == 0.0 and state.best_value < state.round_began_at - PROGRESS * abs(
+            state.best_value
+        )
+        state.round_began_at = state.best_value
         state.round += 1
         self._forget()
         uniform: Array = self._random.random((self.population, self.dimension))
-        return uniform * uniform * (3.0 - 2.0 * uniform)
+        if state.about_best and state.best is not None:
+            reach = self._random.random((self.population, 1))
+            about: Array = np.clip(state.best + reach * reach * reach * (2.0 * uniform - 1.0), 0.0, 1.0)
+            return about
+        return self._half_linear(uniform * uniform * (3.0 - 2.0 * uniform))
+
+    def _note_end(self) -> None:
+        """Where the round ended, and how low: as low as the earlier one in whose valley it was given up."""
+        state = self._state
+        allowed = np.flatnonzero(state.violations == 0.0)
+        known = self._known_valley() if state.age >= self._exploration else None
+        lowest = math.inf
+        if allowed.size:
+            first = allowed[np.argmin(state.objectives[allowed])]
+            lowest = float(state.objectives[first])
+            if known is None:
+                state.end_points = np.concatenate([state.end_points, state.points[first : first + 1]])
+                state.end_values = np.append(state.end_values, lowest)
+            else:
+                lowest = min(lowest, float(state.end_values[known]))
+        if not state.about_best:
+            state.ends = np.append(state.ends, lowest)
+
+    def _known_valley(self) -> int | None:
+        """The index of the end point about which the best quarter of this round's points lies, if there is one."""
+        state = self._state
+        if not len(state.end_points) or len(state.points) < self._kept:
+            return None
+        best = state.points[: -(-len(state.points) // 4)]
+        distances = np.abs(best[None] - state.end_points[:, None]).max(axis=(1, 2))
+        nearest = int(np.argmin(distances))
+        return nearest if distances[nearest] <= SAME_VALLEY else None
+
+    def _half_linear(self, points: Array) -> Array:
+        """The points [n, d] in 0 .. 1, every other one of them along linear scales."""
+        linear = self.lower + points[1::2] * (self.upper - self.lower)
+        points[1::2] = self.space.of(linear)
+        return points
 
     def _forget(self) -> None:
         state = self._state
@@ -249,6 +313,8 @@ class HGA(Optimizer):
             state.goal, state.waited = best - PROGRESS * abs(best), 0
         else:
             state.waited += told
+        if not state.about_best and state.objectives[0] >= state.best_value and self._known_valley() is not None:
+            return True
         return state.waited > PATIENCE * self._kept or self._is_higher()
 
     def _is_higher(self) -> bool:
@@ -262,11 +328,17 @@ class HGA(Optimizer):
     def _polished(self) -> Array:
         points, merits = self._state.points, self._merits(self._state.objectives, self._state.violations)
         best, median = merits[0], merits[merits.size // 2]
-        centre, cloud = model_step(points, np.minimum(merits, best + PENALTY_CAP * (median - best)), TRUST_RADIUS)
+        values = np.minimum(merits, best + PENALTY_CAP * (median - best))
         # Uniform with variance 1: a normal draw's rare tails would go through the C library.
         deviation = (2.0 * self._random.random((self.polish, self.dimension)) - 1.0) * np.sqrt(3.0)
+        groups = np.array_split(deviation, max(1, self.polish // GROUP))
+        return np.concatenate([self._sampled(points, values, group, i) for i, group in enumerate(groups)])
+
+    def _sampled(self, points: Array, values: Array, deviation: Array, group: int) -> Array:
+        """The model's minimum within the group's radius and samples about it and about the best point."""
+        centre, cloud = model_step(points, values, RADII[group % len(RADII)] * TRUST_RADIUS)
         deviation[0] = 0.0
-        about = np.where(np.arange(self.polish)[:, None] % 2 == 0, centre, points[0])
+        about = np.where(np.arange(len(deviation))[:, None] % 2 == 0, centre, points[0])
         spread = (cloud[None, :, :] * deviation[:, None, :]).sum(axis=2)
         samples: Array = np.clip(about + SAMPLE_SPREAD * spread, 0.0, 1.0)
         return samples
@@ -318,16 +390,23 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
     best = None if state["best"] is None else _unit([state["best"]], dimension)[0]
     points = _unit(state["points"], dimension)
     objectives, violations = _finite(state["objectives"]), _finite(state["violations"])
-    if not len(points) == len(objectives) == len(violations) or not isinstance(state["searching"], bool):
+    if not len(points) == len(objectives) == len(violations) or any(
+        not isinstance(state[name], bool) for name in _FLAGS
+    ):
         raise ValueError("points, objectives and violations")
+    end_points, end_values = _unit(state["end_points"], dimension), _finite(state["end_values"])
+    if len(end_points) != len(end_values):
+        raise ValueError("end points and values")
     if (best is None) != (state["generation"] == 0) or (best is None) != (numbers["best_value"] == math.inf):
         raise ValueError("best")
     return HGAState(
         candidates=_unit(state["candidates"], dimension),
         best=best,
         points=points,
-        searching=state["searching"],
+        **{name: state[name] for name in _FLAGS},
         ends=np.append(np.empty(0), [math.inf if one is None else float(_finite([one])[0]) for one in state["ends"]]),
+        end_points=end_points,
+        end_values=end_values,
         objectives=objectives,
         violations=violations,
         **{name: state[name] for name in _COUNTS},

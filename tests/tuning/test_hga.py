@@ -260,6 +260,23 @@ def test_a_run_that_has_converged_says_so_and_finds_hardly_better_in_the_rest_of
         assert hga.best_value >= found / 1.001
 
 
+def test_bounds_that_fit_and_bounds_that_are_decades_wide_are_both_met_by_the_first_population() -> None:
+    """Half of it lies along the logarithmic scales, in which a linear population has no point below 1 here."""
+    first = HGA([1e-3] * 2, [1e3] * 2, seed=1, logarithmic=[True, True]).ask()
+    assert 5 <= np.count_nonzero((first > 100.0).all(axis=1)) <= 25
+    assert 2 <= np.count_nonzero((first < 1.0).all(axis=1)) <= 15
+
+
+def test_a_round_that_has_found_better_is_followed_by_one_about_the_best() -> None:
+    hga = cube(2, generations=100)
+    while hga.state()["round"] == 0:
+        hga.tell(1.0 + sphere(hga.ask() - 0.3))
+    near = np.abs(hga.ask() - 0.3).max(axis=1)
+    assert hga.state()["about_best"]
+    assert np.count_nonzero(near < 0.1) > 10
+    assert np.count_nonzero(near > 1.0) > 3
+
+
 DAMAGE = {
     "lower": [5.0, 5.0],
     "evaluations": -1,
@@ -268,6 +285,10 @@ DAMAGE = {
     "points": [[0.5]],
     "objectives": [1.0, float("nan")],
     "searching": 3,
+    "about_best": None,
+    "round_began_at": "low",
+    "end_points": [[0.5]],
+    "end_values": [1.0],
     "violations": [0.0],
     "penalty": "much",
     "best": [0.5],

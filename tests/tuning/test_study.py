@@ -17,6 +17,8 @@ import pytest
 
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
+from tdof_npid_ros.paper.tuned import tuned
+from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -201,3 +203,17 @@ def progress(checkpoint: Path) -> int:
     if not checkpoint.exists():
         return -1
     return int(json.loads(checkpoint.read_text())["content"]["optimizer"]["evaluations"])
+
+
+def test_a_loop_with_forty_lanes_needs_few_generations() -> None:
+    """Process 1 from random gains, as the live tuner searches it: within 0.1 % of the best known."""
+    best = tuned("p1-c0.5", "tdof_npid2")
+    assert best is not None
+    generations = []
+    for seed in range(3):
+        problem = TuningProblem(load_case("p1-c0.5"), "tdof_npid2", seed=seed, generations=60, polish=40)
+        study, objective, target = Study(problem), Objective(problem), 1.001 * best.objective
+        while not study.done and not (study.feasible and study.best_value <= target):
+            study.tell(objective(study.ask()))
+        generations.append(study.generation)
+    assert np.median(generations) <= 20
