@@ -349,9 +349,13 @@ def _is_near(found: Margins) -> bool:
 
 
 def _price(problem: TuningProblem, result: TuningResult, found: Margins) -> dict[str, float] | None:
-    """What it costs to keep M_s within what is usual; None where it is, or was asked for, or nothing was found."""
-    asked = problem.constraints.ms
-    held = price_of_ms(problem, result.gains, USUAL_M_S) if _is_near(found) and asked is None else None
+    """What it costs to keep M_s within what is usual; None where it is, or was asked for, or nothing was found.
+
+    Nor is it told of gains for many plants: M_s is that of the case's own.
+    """
+    if problem.constraints.ms is not None or problem.perturbed or not _is_near(found):
+        return None
+    held = price_of_ms(problem, result.gains, USUAL_M_S)
     if held is None:
         return None
     return {

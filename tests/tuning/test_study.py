@@ -18,7 +18,6 @@ import pytest
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from tdof_npid_ros.paper.tuned import tuned
-from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.optimizers import ALGORITHMS
 from tdof_npid_ros.tuning.problem import TuningProblem
