@@ -12,10 +12,9 @@ That finds the valley of a good controller in a generation or two and then creep
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
 and asks for the model's minimum and for samples about it, shaped like the cloud of kept points. When that has
 stalled, the round is over, and another begins from a new random population, dense at the bounds, and polishes more
-patiently, until the budget is spent. A round whose points agree already, but in a valley higher than the best,
-is given up, and so is one whose best points gather where an earlier round ended. After a round that has found a better
-best, the next one begins about it, near and far: a narrow valley is walked in more than one round. Every candidate
-counts as an evaluation. `polish=0` is the paper's HGA alone.
+patiently, until the budget is spent. A round whose points agree already, but in a valley that lies higher than the best
+is given up. After a round that has found a better best, the next one begins about it, near and far: a narrow valley is
+walked in more than one round. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
 
 Half of each random population is drawn along the parameters' scales, half of it linearly: bounds that fit lie about
 the gains, bounds that are decades wide do not.
@@ -72,9 +71,6 @@ PROGRESS, PATIENCE = 1e-4, 3.0
 HIGHER = 4.0
 """A round is given up when its best point lies higher than the run's by so many times median - best of its points."""
 
-SAME_VALLEY = 0.1
-"""A round is given up when the best quarter of its points is no farther than this from where another one ended."""
-
 PENALTY, STIFFER = 3.0, 4.0
 """Of the merit: at first, and by which factor it grows."""
 
@@ -102,7 +98,6 @@ class HGAState(SearchState):
         goal: the merit below which this round counts as having made progress; `waited`: evaluations since.
         penalty: of the merit in this round.
         ends: the lowest allowed values of the rounds that began anywhere and are over; infinite where there is none.
-        end_points: [k, d], the different points where rounds ended, with something allowed, and end_values [k] there.
     """
 
     round: int = 0
@@ -117,8 +112,6 @@ class HGAState(SearchState):
     waited: int = 0
     penalty: float = PENALTY
     ends: Array = field(default_factory=lambda: np.empty(0))
-    end_points: Array = field(default_factory=lambda: np.empty((0, 0)))
-    end_values: Array = field(default_factory=lambda: np.empty(0))
 
 
 _COUNTS = ("evaluations", "generation", "round", "age", "waited")
@@ -172,7 +165,7 @@ class HGA(Optimizer):
         self.eta, self.mutation_rate, self.shape = eta, mutation_rate, shape
         self._random = np.random.Generator(np.random.PCG64(seed))
         uniform = self._random.random((population, self.dimension))
-        self._state = HGAState(self._with_starts(self._half_linear(uniform)), end_points=np.empty((0, self.dimension)))
+        self._state = HGAState(self._with_starts(self._half_linear(uniform)))
         self._forget()
 
     @property
@@ -191,7 +184,9 @@ class HGA(Optimizer):
         state = self._state
         if state.violations[0] > 0.0:
             state.penalty *= STIFFER
-        self._note_end()
+        if not state.about_best:
+            lowest = state.objectives[state.violations == 0.0].min(initial=math.inf)
+            state.ends = np.append(state.ends, lowest)
         state.about_best = state.best_violation == 0.0 and state.best_value < state.round_began_at - PROGRESS * abs(
             state.best_value
         )
@@ -204,33 +199,6 @@ class HGA(Optimizer):
             about: Array = np.clip(state.best + reach * reach * reach * (2.0 * uniform - 1.0), 0.0, 1.0)
             return about
         return self._half_linear(uniform * uniform * (3.0 - 2.0 * uniform))
-
-    def _note_end(self) -> None:
-        """Where the round ended, and how low: as low as the earlier one in whose valley it was given up."""
-        state = self._state
-        allowed = np.flatnonzero(state.violations == 0.0)
-        known = self._known_valley() if state.age >= self._exploration else None
-        lowest = math.inf
-        if allowed.size:
-            first = allowed[np.argmin(state.objectives[allowed])]
-            lowest = float(state.objectives[first])
-            if known is None:
-                state.end_points = np.concatenate([state.end_points, state.points[first : first + 1]])
-                state.end_values = np.append(state.end_values, lowest)
-            else:
-                lowest = min(lowest, float(state.end_values[known]))
-        if not state.about_best:
-            state.ends = np.append(state.ends, lowest)
-
-    def _known_valley(self) -> int | None:
-        """The index of the end point about which the best quarter of this round's points lies, if there is one."""
-        state = self._state
-        if not len(state.end_points) or len(state.points) < self._kept:
-            return None
-        best = state.points[: -(-len(state.points) // 4)]
-        distances = np.abs(best[None] - state.end_points[:, None]).max(axis=(1, 2))
-        nearest = int(np.argmin(distances))
-        return nearest if distances[nearest] <= SAME_VALLEY else None
 
     def _half_linear(self, points: Array) -> Array:
         """The points [n, d] in 0 .. 1, every other one of them along linear scales."""
@@ -313,8 +281,6 @@ class HGA(Optimizer):
             state.goal, state.waited = best - PROGRESS * abs(best), 0
         else:
             state.waited += told
-        if not state.about_best and state.objectives[0] >= state.best_value and self._known_valley() is not None:
-            return True
         return state.waited > PATIENCE * self._kept or self._is_higher()
 
     def _is_higher(self) -> bool:
@@ -394,9 +360,6 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
         not isinstance(state[name], bool) for name in _FLAGS
     ):
         raise ValueError("points, objectives and violations")
-    end_points, end_values = _unit(state["end_points"], dimension), _finite(state["end_values"])
-    if len(end_points) != len(end_values):
-        raise ValueError("end points and values")
     if (best is None) != (state["generation"] == 0) or (best is None) != (numbers["best_value"] == math.inf):
         raise ValueError("best")
     return HGAState(
@@ -405,8 +368,6 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
         points=points,
         **{name: state[name] for name in _FLAGS},
         ends=np.append(np.empty(0), [math.inf if one is None else float(_finite([one])[0]) for one in state["ends"]]),
-        end_points=end_points,
-        end_values=end_values,
         objectives=objectives,
         violations=violations,
         **{name: state[name] for name in _COUNTS},

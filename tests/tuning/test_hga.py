@@ -287,8 +287,6 @@ DAMAGE = {
     "searching": 3,
     "about_best": None,
     "round_began_at": "low",
-    "end_points": [[0.5]],
-    "end_values": [1.0],
     "violations": [0.0],
     "penalty": "much",
     "best": [0.5],
