@@ -368,7 +368,7 @@ def _price(problem: TuningProblem, result: TuningResult, found: Margins) -> dict
 def _warning(report: dict[str, Any]) -> str:
     price = report["price"]
     near = f"M_s is above {USUAL_M_S:g}, nearer to instability than is usual: --ms {USUAL_M_S:g} keeps away from it"
-    return near + (f", objective {price['objective']:.6g} ({price['percent']:+.1f} %)" if price else "")
+    return near + (f", objective at most {price['objective']:.6g} ({price['percent']:+.1f} %)" if price else "")
 
 
 def _compared(problem: TuningProblem, tuned: Gains) -> dict[str, Gains]:

@@ -12,18 +12,26 @@ from tdof_npid_ros.tuning.study import Study, TuningResult
 FRACTION = 4
 """Of a search's generations, one in so many is spent on the price, and of the usual search's at the most."""
 
+LEAST = 500
+"""Evaluations: what fewer of them find says nothing about the price."""
+
 
 def price_of_ms(problem: TuningProblem, gains: Gains, ms: float) -> TuningResult | None:
-    """What a short search finds, from these gains, with M_s held to `ms`; None if it finds nothing allowed.
+    """What a short search finds, from these gains, with M_s held to `ms`: at most so much is the price.
+
+    None if it finds nothing allowed, or would be too short.
 
     Args:
         problem: the one that the gains were found for, with a linear model.
         gains: of the problem's controller.
     """
+    generations = min(problem.generations, GENERATIONS) // FRACTION
+    if generations * problem.population < LEAST:
+        return None
     held = replace(
         problem,
         case=replace(problem.case, gains=gains),
-        generations=max(1, min(problem.generations, GENERATIONS) // FRACTION),
+        generations=generations,
         constraints=replace(problem.constraints, ms=ms),
         warm=True,
         until_converged=True,

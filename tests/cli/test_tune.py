@@ -90,16 +90,21 @@ def test_the_margins_asked_for_are_kept_and_cost_objective(capsys: pytest.Captur
 
 
 def test_a_lively_loop_is_told_with_what_it_costs_to_be_none(capsys: pytest.CaptureFixture[str]) -> None:
-    lively = json_of(capsys, "p1-c0.5", "--controller", "pid", "--budget", "800")
+    lively = json_of(capsys, "p1-c0.5", "--controller", "pid", "--budget", "2400")
     price = lively["price"]
     assert lively["margins"]["m_s"] > 2.5
     assert price["ms"] == 2.0
     assert price["percent"] == pytest.approx(100 * (price["objective"] / lively["objective"] - 1))
-    held = json_of(capsys, "p1-c0.5", "--controller", "pid", "--budget", "800", "--ms", "2")
+    held = json_of(capsys, "p1-c0.5", "--controller", "pid", "--budget", "2400", "--ms", "2")
     assert price["objective"] == pytest.approx(held["objective"], rel=0.05)
     assert held["price"] is None
-    assert main(["tune", "p1-c0.5", "--controller", "pid", "--budget", "800"]) == 0
-    assert f"objective {price['objective']:.6g} (+{price['percent']:.1f} %)" in capsys.readouterr().out
+    assert main(["tune", "p1-c0.5", "--controller", "pid", "--budget", "2400"]) == 0
+    assert f"objective at most {price['objective']:.6g} (+{price['percent']:.1f} %)" in capsys.readouterr().out
+
+
+def test_what_a_short_search_would_say_about_the_price_is_not_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tune", "p1-c0.5", "--controller", "pid", "--budget", "400"]) == 0
+    assert "--ms 2 keeps away from it\n" in capsys.readouterr().out
 
 
 def test_margins_that_nothing_within_the_bounds_has_are_said_and_no_gains_given(
