@@ -166,11 +166,6 @@ GAINS: Final = table(
     Parameter("n", 10.0, "derivative filter N (1b); usually 5 to 30", within=ABOVE_0_FINITE),
     Parameter("effort_min", -math.inf, "lower limit of the effort", "the effort's unit", per_lane=True, of_loop=True),
     Parameter("effort_max", math.inf, "upper limit of the effort", "the effort's unit", per_lane=True, of_loop=True),
-    Parameter(
-        "full_unwinding",
-        False,
-        "integrate the whole error, k(e) = 1, where that makes the integral action smaller; false: the paper's law",
-    ),
     Parameter("anti_windup", "conditional", "what the integral action does at a limit", choices=ANTI_WINDUP),
     Parameter(
         "tracking_time",
@@ -181,6 +176,11 @@ GAINS: Final = table(
     ),
     Parameter("integral_min", -math.inf, "lower limit of the integral action", "the effort's unit"),
     Parameter("integral_max", math.inf, "upper limit of the integral action", "the effort's unit"),
+    Parameter(
+        "full_unwinding",
+        False,
+        "integrate the whole error, k(e) = 1, where that makes the integral action smaller; false: the paper's law",
+    ),
 )
 OPTIONS: Final = table(
     Parameter("manual", False, "true: the effort is manual_effort; back to false without a jump"),
