@@ -36,8 +36,8 @@ AT_REST = 0.01  # of a curve's range: nearer to where it ends, it counts as ther
 ROOM = 1.3  # a picture ends this much later than the last curve has come to rest
 LEAST_SHOWN = 0.05  # of the whole time
 KICK = 4.0  # an effort's range is cut where a few first samples alone make it this many times larger
-KICK_SAMPLES = 0.02  # of the samples that are not at rest: how many a kick has at the most
-STILL = 1e-3  # of an effort's range: nearer to its median, it is at rest
+KICK_SAMPLES = 0.02  # of all samples: how many a kick has at the most
+LARGEST_KICK = 300.0  # times what follows: beyond, what follows is rest, and the kicks are the response
 
 
 class PlottingError(ValueError):
@@ -122,10 +122,10 @@ def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
     if not values.size:
         return 0.0, 1.0, False
     low, high = float(values.min()), float(values.max())
-    usual = [np.quantile(_moving(v), (KICK_SAMPLES, 1.0 - KICK_SAMPLES)) for v in shown if v.size]
+    usual = [np.quantile(v, (KICK_SAMPLES, 1.0 - KICK_SAMPLES)) for v in shown if v.size]
     least, most = min(float(q[0]) for q in usual), max(float(q[1]) for q in usual)
     wide = max(most - least, 1e-300)
-    cut = high - low > KICK * wide
+    cut = KICK * wide < high - low < LARGEST_KICK * wide
     if cut:
         low, high = max(low, least - wide), min(high, most + wide)
     for curve in panel.curves:
@@ -133,15 +133,6 @@ def effort_range(panel: Panel, until: float) -> tuple[float, float, bool]:
             low, high = min(low, float(curve.disturbance.min())), max(high, float(curve.disturbance.max()))
     margin = 0.06 * ((high - low) or max(abs(high), 1.0))
     return low - margin, high + margin, cut
-
-
-def _moving(effort: np.ndarray) -> np.ndarray:
-    """Of an effort, what is not at rest; all of it where nothing moves.
-
-    Long rests between steps would else make every response a kick.
-    """
-    moving = effort[np.abs(effort - np.median(effort)) > STILL * np.ptp(effort)]
-    return moving if moving.size else effort
 
 
 def new_figure(

@@ -51,6 +51,13 @@ def test_a_kick_does_not_flatten_the_effort() -> None:
     assert effort_range(panel(effort, np.exp(-TIME)), 10.0)[1:] == pytest.approx((1.06, False), abs=0.01)
 
 
+def test_short_responses_between_long_rests_are_no_kicks() -> None:
+    effort = 1e-3 * np.sin(TIME)
+    effort[:5], effort[500:505] = 20.0, -20.0
+    low, high, cut = effort_range(panel(effort, effort), 10.0)
+    assert not cut and low < -20.0 and high > 20.0
+
+
 def test_nothing_known_of_the_effort_is_no_error(tmp_path: Path) -> None:
     draw_responses([panel(TIME, np.full_like(TIME, np.nan))], tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
