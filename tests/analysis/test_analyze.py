@@ -291,7 +291,7 @@ def test_files_and_json(bag, tmp_path, capsys, case) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_the_page_works_in_a_browser(bag, tmp_path) -> None:
-    """Loaded from disk: all plots draw, nothing is fetched or complained of, the wheel with Ctrl zooms, a click hides."""
+    """Loaded from disk: all plots draw, nothing is fetched or complained of, Ctrl and wheel zoom, a click hides."""
     page_file = tmp_path / "a.html"
     analyze([bag]).html(page_file)
     with chromium_page(CHROMIUM, width=1280) as page:
