@@ -19,6 +19,7 @@ from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.controller import Controller
 
 ALL = os.environ.get("TDOF_NPID_ALL_BITS") == "1"  # every bit of every byte, instead of one of each fifth
+INTEGER, DOUBLE = 2, 3  # rcl_interfaces/msg/ParameterType
 Messages = list[tuple[str, str, int, bytes]]  # topic, type, log time, data
 
 
@@ -79,7 +80,7 @@ def flips(messages: Messages, topic: str) -> Iterator[tuple[int, int, int, Messa
 
 
 def says_the_same(reader: BagReader, topic: str, one: bytes, other: bytes) -> bool:
-    """Whether the flipped bit lies in padding, or in the encoding's unused options."""
+    """Whether the flipped bit lies in padding, in the encoding's unused options, or makes 0 of 0.0."""
     try:
         return repr(plain(reader.decode(topic, one))) == repr(plain(reader.decode(topic, other)))
     except BagError:
@@ -88,6 +89,8 @@ def says_the_same(reader: BagReader, topic: str, one: bytes, other: bytes) -> bo
 
 def plain(value: object) -> object:
     if isinstance(value, dict):
+        if value.get("type") == DOUBLE and value["double_value"] == 0.0:
+            value = value | {"type": INTEGER}  # a parameter file may give 0 for 0.0: the same parameter
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return value.tobytes()

@@ -169,7 +169,8 @@ def test_the_parameter_file_is_one_for_the_controller_node(tmp_path: Path, capsy
     parameters = yaml.safe_load(out.read_text())["/**/controller"]["ros__parameters"]
     assert parameters["type"] == "tdof_npid2"
     assert {name: parameters[name] for name in gains} == gains
-    assert all(isinstance(value, float) for name, value in parameters.items() if name not in ("type", "anti_windup"))
+    others = {"type": str, "anti_windup": str, "full_unwinding": bool}
+    assert all(isinstance(value, others.get(name, float)) for name, value in parameters.items())
 
 
 def test_ros_reads_the_parameter_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
