@@ -33,7 +33,7 @@ def test_gains_are_tuned_looked_at_and_only_then_applied(tmp_path: Path) -> None
             eventually(lambda: model(page, "proposal", "w.visible"), told)
             assert program.tdof_npid("get", "kp")["kp"] == published
             texts = str(model(page, "proposal", "w.children.map(c => c.text ?? '').join()"))
-            for fact in ("overshoot", "M_s", "delay margin", "now", "tuned", "kp"):
+            for fact in ("overshoot", "M_<wbr>s", "delay margin", "now", "tuned", "kp"):
                 assert fact in texts, fact
             names = set(model(page, "proposal", "w.children.flatMap(c => (c.renderers ?? []).map(r => r.name))"))
             assert {"now", "tuned"} <= names
