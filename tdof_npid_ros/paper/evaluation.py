@@ -68,7 +68,8 @@ def paper_case(name: str) -> Case:
 
 def published_gains(published: Published) -> Gains:
     """The printed gains with the case's limits and anti-windup."""
-    values = {name: getattr(published.gains, name) for name in PER_LANE}
+    printed = published.gains
+    values = {name: getattr(printed, name) for name in PER_LANE}
     return paper_case(published.case).gains.with_values(type=published.controller, **values)
 
 
