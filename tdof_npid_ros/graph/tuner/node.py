@@ -217,6 +217,8 @@ class TunerNode(LoopNode):
         """Stop at the end of the generation; asked again, or while no loop is in use, at once."""
         self.stop_at_once = self.stop_requested or not self.activated.is_set() or not self.evaluator.in_use
         self.stop_requested = True
+        if self.phase == "tuning" and not self.stop_at_once:
+            self.get_logger().info("stops with this generation; a second Ctrl-C stops at once")
 
     def check_interrupted(self) -> None:
         """Raise InterruptedTuningError if asked to stop at once, or to stop and no loop is left to end the
