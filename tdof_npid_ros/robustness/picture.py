@@ -10,12 +10,13 @@ import numpy as np
 from tdof_npid_ros.interactive import Page, finish_legend, new_plot, source_of
 from tdof_npid_ros.interactive import draw as curve
 from tdof_npid_ros.metrics import in_units
-from tdof_npid_ros.plotting import GUIDE, PALETTE, new_figure, save
+from tdof_npid_ros.plotting import GUIDE, PALETTE, Curve, Panel, new_figure, save, shown_until
 from tdof_npid_ros.robustness.result import QUANTILES, RobustResult
 from tdof_npid_ros.robustness.sweep import METRICS, shown_samples
 
 BANDS = ((0.05, 0.95, 0.18), (0.25, 0.75, 0.3))  # quantiles, and how dark what lies between them is
 HISTOGRAM = 40  # bins
+LAST_BIN = "the last bin holds all beyond"
 
 
 def draw(result: RobustResult, path: Path) -> None:
@@ -39,6 +40,7 @@ def draw(result: RobustResult, path: Path) -> None:
         axis.set_title(episode, fontsize=11, loc="left", fontweight="bold")
         axis.set_xlabel("time (s)")
         axis.set_ylim(*_limits(fan, nominal))
+        axis.set_xlim(time[0], _until(time, fan))
     axes[0][0].set_ylabel("output y")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
@@ -46,10 +48,12 @@ def draw(result: RobustResult, path: Path) -> None:
     for axis, name in zip(cells, shown, strict=False):
         counts, edges = _histogram(result.metrics[name])
         axis.stairs(counts, edges, fill=True, color=PALETTE[0], alpha=0.6)
+        axis.set_axisbelow(True)
         for quantile, dash in zip(QUANTILES, (":", "-", ":"), strict=True):
             if np.isfinite(value := result.quantile(name, quantile)):
                 axis.axvline(value, color=PALETTE[1], linewidth=1.2, linestyle=dash)
         axis.set_title(METRICS[name], fontsize=10, loc="left")
+        axis.set_title(LAST_BIN, fontsize=8, loc="right", color="#555555")
         axis.set_ylabel("plants", fontsize=9)
     for axis in cells[len(shown) :]:
         axis.set_visible(False)
@@ -82,6 +86,7 @@ def page(result: RobustResult) -> Page:
             ),
         ]
     )
+    made.text(f"Plants by metric; {LAST_BIN}.")
     for name in _histogram_metrics(result):
         made.plot(_histogram_plot(result, name))
     made.heading("What they depend on")
@@ -131,6 +136,13 @@ def _limits(fan: np.ndarray, nominal: np.ndarray) -> tuple[float, float]:
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
+def _until(time: np.ndarray, fan: np.ndarray) -> float:
+    """When nearly all plants have come to rest."""
+    unknown = np.full(len(time), np.nan)
+    edges = np.quantile(fan, (0.05, 0.5, 0.95), axis=1)
+    return shown_until(Panel("", [Curve("", time, edge, unknown) for edge in edges]))
+
+
 def _histogram_metrics(result: RobustResult) -> list[str]:
     """Those with numbers enough to show."""
     return [name for name, values in result.metrics.items() if np.isfinite(values).sum() > 1]
@@ -157,6 +169,7 @@ def _fan_plot(result: RobustResult, episode: str) -> Any:
     curve(plot, source_of(time, np.median(fan, axis=1), "median"), "median", color=PALETTE[0])
     curve(plot, source_of(signals.time, nominal, "the model"), "the model", color=PALETTE[1], dash="dashed")
     plot.y_range.start, plot.y_range.end = _limits(fan, nominal)
+    plot.x_range.start, plot.x_range.end = float(time[0]), _until(time, fan)
     finish_legend(plot)
     return plot
 
