@@ -404,7 +404,7 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
     outputs, events = loops.collect("/real/output", JointState), loops.collect("/parameter_events", ParameterEvent)
     bounds = {"kp": (0.5, 20.0), "ki": (0.1, 5.0), "kd": (0.0, 2.0)}  # kp above some 16 is unstable
     case = replace(short("p1-c0.5"), bounds=bounds)
-    which = TuningProblem(case, "pid", seed=15, population=4, generations=2, polish=2)
+    which = TuningProblem(case, "pid", seed=35, population=3, generations=1, polish=0)
     test = StepTest((0.0, 1.0), 0.1, 1.0, 25.0, (-1.0, 2.0), (-40.0, 40.0))
     loop = AlternateLoop(tuner.node, which, test, "/real", Patience(60.0, 5.0, lambda: None))
     study = Study(which)
@@ -426,9 +426,8 @@ def test_a_plant_that_cannot_be_reset_is_tuned_by_steps_back_and_forth(loops: An
         assert all(low <= value <= high for value in applied[name])
     gains = study.result.gains
     assert loops.get_parameters("/real/controller", "kp", "ki", "kd") == [gains.kp, gains.ki, gains.kd]
-    assert (
-        2.0 < max(abs(m.position[0]) for m in outputs if m.position) < 5.0
-    )  # one at least was aborted, soon after it left -1 .. 2
+    reached = [message.position[0] for message in outputs if message.position]
+    assert 0.0 < max(max(reached) - 2.0, -1.0 - min(reached)) < 3.0  # one was aborted, soon after it left -1 .. 2
     assert study.best_value < 5.0
 
 
