@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 from tdof_npid_ros.cli.experiment import add_experiment_arguments, at_rest, proposal_of, recorded, told
 from tdof_npid_ros.cli.loop_client import observed
 from tdof_npid_ros.commissioning.confirm import Confirmed, confirmed, settling_time
-from tdof_npid_ros.commissioning.design import Design, check_relay, designed, identified
+from tdof_npid_ros.commissioning.design import SET, Design, check_relay, designed, identified
 from tdof_npid_ros.commissioning.report import Commissioning, lines_of
 from tdof_npid_ros.control.gains import controller_type
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.excitation import KINDS, rest_of
+from tdof_npid_ros.interruption import afterwards, heeded
 from tdof_npid_ros.output_file import OutputError, check_outputs, new_folder
 from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.tuning import TuningError
@@ -58,12 +59,21 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs([path for path in (arguments.html, arguments.out) if path])
     work = Commissioning(arguments.namespace, str(bag))
     say: Callable[[str], None] = (lambda text: None) if arguments.json else (lambda text: print(text, flush=True))
-    with observed(arguments.namespace) as observer, recorded(observer, arguments.namespace, bag):
-        _commission(LoopAtWork(observer), work, arguments, say)
     html = arguments.html or bag / "commission.html"
-    work.page().write(html)
-    if arguments.out is not None and work.design is not None:
-        arguments.out.write_text(work.design.draft.text(), encoding="utf-8")
+    with heeded(), observed(arguments.namespace) as observer:
+        loop = LoopAtWork(observer)
+        before = {name: loop.values[name] for name in SET}
+        try:
+            with recorded(observer, arguments.namespace, bag):
+                _commission(loop, work, arguments, say)
+            work.page().write(html)
+            if arguments.out is not None and work.design is not None:
+                arguments.out.write_text(work.design.draft.text(), encoding="utf-8")
+        except KeyboardInterrupt:
+            if work.outcome == "kept":
+                with afterwards():
+                    observer.remote("controller").set_parameters(before)
+            raise
     say(f"{work.outcome}: {work.reason}\nreport   {html}\nbag      {bag}")
     if arguments.json:
         print(json.dumps(work.as_json() | {"report": str(html)}, allow_nan=False))

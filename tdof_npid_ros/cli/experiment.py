@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdof_npid_ros.cli.loop_client import observed
 from tdof_npid_ros.identification.excitation import KINDS, By, Proposal, Rest, proposed, relay_point
+from tdof_npid_ros.interruption import heeded
 from tdof_npid_ros.output_file import new_folder
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tdof_npid_ros.graph.experimenter import Hold, LoopAtWork, record_of
 
     bag = new_folder(arguments.bag or Path("bags") / f"experiment-{time.strftime('%Y%m%d-%H%M%S')}")
-    with observed(arguments.namespace) as observer, recorded(observer, arguments.namespace, bag):
+    with heeded(), observed(arguments.namespace) as observer, recorded(observer, arguments.namespace, bag):
         loop = LoopAtWork(observer)
         rest = at_rest(loop, arguments)
         proposal = proposal_of(loop, rest, arguments, arguments.kind)
@@ -148,7 +149,7 @@ def recorded(observer: LoopObserver, namespace: str, bag: Path) -> Iterator[None
         processes = stack.enter_context(NodeProcesses(find_parameter_file("p1-c0.5"), namespace))
         processes.start("recorder", {"bag": str(bag)})
         end = time.monotonic() + RECORDER_PATIENCE
-        while not (state := observer.nodes.get("recorder")) or str(bag) not in state.text:
+        while not (state := observer.nodes.get("recorder")) or state.facts.get("bag") != str(bag):
             processes.check()
             if time.monotonic() > end:
                 raise RuntimeError(f"the recorder does not record to {bag} within {RECORDER_PATIENCE:g} s")

@@ -6,6 +6,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, RefusedE
 from tdof_npid_ros.identification.excitation import By, Excitation, Rest, rest_of
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.identification.records import EVEN, Record
+from tdof_npid_ros.interruption import afterwards, check
 from tdof_npid_ros.parameters import EXPERIMENT, GAINS
 
 POLL = 0.005  # s
@@ -144,7 +146,7 @@ class LoopAtWork:
 
 class Hold:
     """The loop in the hands of an experiment, under the controller's guard. What `move` and `apply` change is restored
-    at the end, unless `keep` ends it.
+    at the end, unless `keep` ends it. Ctrl-C comes between two answers, so that each request is made whole.
 
     Args:
         loop: at work.
@@ -175,18 +177,28 @@ class Hold:
             "safe_range.output": list(safe_output),
             "safe_range.effort": list(safe_effort),
         }
+        self._stack = ExitStack()
         self._ended = False
         self._renew_at = 0.0
         self.taken: list[Row] = []
 
     def __enter__(self) -> Hold:
-        self.taken, self._seen = self._observer.rows_since(max(0, self._observer.count - REST_SAMPLES))
-        self._set(self._settings)
+        with ExitStack() as stack:
+            stack.enter_context(afterwards())
+            check()
+            self.taken, self._seen = self._observer.rows_since(max(0, self._observer.count - REST_SAMPLES))
+            self._set(self._settings)
+            stack.callback(self._end)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _end(self) -> None:
         if not self._ended:
-            self.keep({})
+            self._ended = True
+            self._set({"experiment": ""}, named=False)
 
     def move(self, setpoint: float | None = None, effort: float | None = None) -> None:
         """Give a setpoint, or an effort by hand."""
@@ -199,6 +211,7 @@ class Hold:
 
     def keep(self, values: Mapping[str, Any]) -> None:
         """End the experiment; these gains stay, all else is restored."""
+        check()
         self._ended = True
         self._set({"experiment": "", **values}, named=False)
 
@@ -218,6 +231,7 @@ class Hold:
 
     def renew(self) -> None:
         """Keep the lease, while nothing else is asked of the loop."""
+        check()
         if time.monotonic() > self._renew_at:
             self._set({})
 

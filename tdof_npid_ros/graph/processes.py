@@ -7,14 +7,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from tdof_npid_ros.graph.__main__ import PARENT
+from tdof_npid_ros.interruption import afterwards
 from tdof_npid_ros.parameter_file import for_ros, read_parameters, write_parameters
 
 STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
@@ -22,23 +21,6 @@ STOP_TIMEOUT = 10.0  # s until a process that does not stop is killed
 
 class NodeProcessError(RuntimeError):
     """A node that could not be started or has ended; the message shows the end of its log."""
-
-
-@contextmanager
-def _interrupted_afterwards() -> Iterator[None]:
-    """Let Ctrl-C wait until this is done: a process that has been started but is not noted yet would never be
-    stopped."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    interrupts: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if interrupts:
-        raise KeyboardInterrupt
 
 
 class NodeProcesses:
@@ -82,7 +64,7 @@ class NodeProcesses:
             write_parameters(file, {node: plain})
         command = [sys.executable, "-m", "tdof_npid_ros.graph", node, "--ros-args", "--params-file", for_ros(file)]
         command += [word for name, other in self._names.items() for word in ("-r", f"{name}:={other}")]
-        with self.log(node).open("wb") as log, _interrupted_afterwards():
+        with self.log(node).open("wb") as log, afterwards():  # else one that is not noted yet would never be stopped
             # A session of its own: Ctrl-C reaches this program alone, which then stops its nodes in order.
             self._processes[node] = subprocess.Popen(
                 command,
@@ -122,7 +104,7 @@ class NodeProcesses:
 
         So a recorder that was started first hears all that the others had to say. Ctrl-C waits until all have ended.
         """
-        with _interrupted_afterwards():
+        with afterwards():
             for process in reversed(self._processes.values()):
                 if process.poll() is None:
                     process.send_signal(signal.SIGINT)

@@ -1,6 +1,6 @@
 """From a running loop to gains, with the tool as a process: near the best there is, with the margin, and never unsafe.
 
-`TDOF_COMMISSION=all` commissions all twenty plants.
+`TDOF_COMMISSION=all` commissions all twenty plants, and interrupts at more moments.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from tdof_npid_ros.tuning.study import Study
 
 HERE = Path(__file__).parent
 MS = 1.8
-CHOSEN = list(LOOPS) if os.environ.get("TDOF_COMMISSION") == "all" else list(QUICK)
+ALL = os.environ.get("TDOF_COMMISSION") == "all"
+CHOSEN = list(LOOPS) if ALL else list(QUICK)
 
 
 def started(graph: Any, loop: Loop) -> None:
@@ -113,16 +114,32 @@ def test_gains_are_near_the_best_with_the_margin_and_the_loop_stays_safe(graph: 
     assert value <= 1.15 * best and m_s <= 2.0
 
 
-def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path) -> None:
-    loop = LOOPS["lag dominant"]
+def is_kept(kp: float, experiment: str, loop: Loop) -> bool:
+    return kp != loop.gains[0] and not experiment
+
+
+MOMENTS = {
+    "experiment": lambda graph, _: graph.get_parameters("/loop/controller", "experiment") != [""],
+    "trial": lambda graph, loop: graph.get_parameters("/loop/controller", "kp") != [loop.gains[0]],
+    "kept": lambda graph, loop: is_kept(*graph.get_parameters("/loop/controller", "kp", "experiment"), loop),
+}
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("moment", MOMENTS if ALL else ["experiment"])
+def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path, moment: str) -> None:
+    """Also in what a script starts in the background, where a shell has SIGINT ignored."""
+    loop = LOOPS["level by hand"]
     started(graph, loop)
     tool = subprocess.Popen(
         [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag"],
-        env=graph.environment, cwd=tmp_path,
+        env=graph.environment, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )  # fmt: skip
-    graph.wait_until(lambda: graph.get_parameters("/loop/controller", "experiment") != [""], 60.0, "the experiment")
+    graph.wait_until(lambda: tool.poll() is not None or MOMENTS[moment](graph, loop), 60.0, f"the {moment}")
     tool.send_signal(signal.SIGINT)
     graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
-    assert tool.returncode == 130
+    _, errors = tool.communicate()
+    assert (tool.returncode, errors) == (130, "tdof-npid commission: interrupted\n")
     found = graph.get_parameters("/loop/controller", "experiment", "kp", "ki", "manual", "setpoint")
-    assert found == ["", *loop.gains, False, loop.start]
+    assert found == ["", *loop.gains, loop.by_hand, loop.start]
