@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tdof_npid_ros.analysis.verify import verify
+from tdof_npid_ros.cli.experiment import records_to
 
 PERIOD = 0.01
 GAINS = {"kp": 2.0, "ki": 4.0, "kd": 0.0, "manual": False}  # the integral takes the plant's pole: at rest in 1 s
@@ -142,3 +143,13 @@ def test_an_operators_setpoint_ends_an_experiment_and_holds(graph: Any) -> None:
     with graph.expect_log(controller, "an operator has given a setpoint"):
         graph.publish_until(publisher, JointState(position=[0.5]), lambda: "has ended" in controller.log)
     graph.wait_until(lambda: robot.y == pytest.approx(0.5, abs=0.02), 60.0, "the operator's setpoint")
+
+
+def test_a_recorder_that_has_lost_messages_records_all_the_same() -> None:
+    from tdof_npid_ros.graph.observer import NodeState
+
+    bag = Path("bag")
+    assert not records_to(bag, None)
+    assert not records_to(bag, NodeState(1, "inactive", {}, 0.0))
+    assert not records_to(bag, NodeState(0, "recording 3 topics to bag2", {"bag": "bag2"}, 0.0))
+    assert records_to(bag, NodeState(1, "5 messages lost, most on /clock: set lossless", {"bag": "bag"}, 0.0))
