@@ -65,7 +65,7 @@ LOOPS = {
     ),
     "heater by hand": Loop(
         first(1.2, 20.0, 2.0, output_offset=20.0, noise=0.05), (1.0, 0.05), 60.0, (30.0, 90.0), 10.0, PER_CENT,
-        by_hand=True,
+        speed=50.0, by_hand=True,
     ),
     "oven": Loop(
         {"model": "second_order", "gain": 1.5, "time_constant": 15.0, "dead_time": 4.0, "output_offset": 25.0,
@@ -113,4 +113,4 @@ LOOPS = {
         first(-2.0, 12.0, 3.0, output_offset=150.0, noise=0.1), (-0.5, -0.03), 50.0, (0.0, 100.0), 10.0, PER_CENT
     ),
 }  # fmt: skip
-QUICK = ("level by hand",)
+QUICK = ("heater by hand",)
