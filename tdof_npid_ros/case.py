@@ -28,6 +28,8 @@ from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
 Bounds = tuple[float, float]
+EPISODES = ("setpoint", "disturbance")
+"""Whose responses the metrics and margins' pictures are of, and whose IAE_SP and IAE_DIS the objective (10) is."""
 SIGMA_BOUNDS = (0.2, 20.0)  # of the tuner's search, as multiples of the setpoint's largest step
 
 
@@ -191,7 +193,7 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        return self.setpoint_metrics(self._output("setpoint", gains))
+        return self.setpoint_metrics(self.response("setpoint", gains).output[:, 0])
 
     def setpoint_metrics(self, y: np.ndarray) -> SetpointMetrics:
         """Those of an output (steps + 1,) of the episode `setpoint`; raises as `setpoint_response`."""
@@ -207,7 +209,7 @@ class Case:
         Raises:
             PlanError, GainsError: there is no such response; the message says why.
         """
-        return self.disturbance_metrics(self._output("disturbance", gains))
+        return self.disturbance_metrics(self.response("disturbance", gains).output[:, 0])
 
     def disturbance_metrics(self, y: np.ndarray) -> DisturbanceMetrics:
         """Those of an output (steps + 1,) of the episode `disturbance`; raises as `disturbance_response`."""
@@ -218,14 +220,18 @@ class Case:
             )
         return disturbance_metrics(y, setpoint, self.sample_period, self.largest_move, self.options.turn)
 
-    def _output(self, episode: str, gains: Gains | None) -> np.ndarray:
-        """The output (steps + 1,) of an episode of one lane."""
+    def response(self, episode: str, gains: Gains | None = None) -> loop.Trajectory:
+        """As `simulate`, of one lane, as metrics need it.
+
+        Raises:
+            PlanError, GainsError: the case has no such episode, or the gains are for several lanes.
+        """
         lanes = (gains or self.gains).lanes
         if lanes > 1:
             raise GainsError(
                 f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each"
             )
-        return self.simulate(episode, gains).output[:, 0]
+        return self.simulate(episode, gains)
 
     def _held(self, episode: str) -> tuple[float, float]:
         """Setpoint and disturbance that an episode holds from its start on.

@@ -162,8 +162,8 @@ def _lanes_of(plants: Plants, gains: Gains) -> int:
     """
     if not isinstance(plants, LanePlants):
         return gains.lanes
-    if gains.lanes > 1 and gains.lanes != 1 + plants.gains.max(initial=0):
-        wanted = 1 + plants.gains.max(initial=0)
+    wanted = 1 + plants.gains.max(initial=0)
+    if gains.lanes not in (1, wanted):
         raise GainsError(f"gains for {gains.lanes} lanes, but plants for {wanted}: give one, or one per lane")
     return plants.lanes
 

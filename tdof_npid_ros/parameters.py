@@ -201,6 +201,24 @@ OPTIONS: Final = table(
     Parameter("angle", False, "true: setpoint and output are angles in rad, the error is the shorter way round"),
     Parameter("bumpless", True, "true: changes of gains and type do not move the effort at once"),
 )
+
+
+def _safe_ranges(output: str, effort: str, *, fixed: bool = False) -> list[Parameter]:
+    """The ranges that end what is tried on a loop; what happens then, of each."""
+    return [
+        Parameter(
+            f"safe_range.{signal}",
+            [-math.inf, math.inf],
+            text,
+            f"the {signal}'s unit",
+            fixed=fixed,
+            length=2,
+            is_interval=True,
+        )
+        for signal, text in (("output", output), ("effort", effort))
+    ]
+
+
 EXPERIMENT: Final = table(
     Parameter("experiment", "", "name of the experiment that has the loop; empty: none, and all is as before"),
     Parameter(
@@ -227,22 +245,7 @@ EXPERIMENT: Final = table(
     Parameter(
         "experiment_duration", 3600.0, "an experiment ends after so much of the loop's time", "s", Range(0.0, 1e9)
     ),
-    Parameter(
-        "safe_range.output",
-        [-math.inf, math.inf],
-        "an experiment ends when the output leaves it",
-        "the output's unit",
-        length=2,
-        is_interval=True,
-    ),
-    Parameter(
-        "safe_range.effort",
-        [-math.inf, math.inf],
-        "an experiment ends before the effort leaves it",
-        "the effort's unit",
-        length=2,
-        is_interval=True,
-    ),
+    *_safe_ranges("an experiment ends when the output leaves it", "an experiment ends before the effort leaves it"),
 )
 CONTROLLER: Final = table(
     SAMPLE_PERIOD,
@@ -520,23 +523,10 @@ TUNER: Final = table(
         fixed=True,
     ),
     Parameter("levels", [0.0, 1.0], "alternate: the two setpoints", "the output's unit", FINITE, fixed=True, length=2),
-    Parameter(
-        "safe_range.output",
-        [-math.inf, math.inf],
+    *_safe_ranges(
         "alternate: a trial ends when the output leaves it",
-        "the output's unit",
-        fixed=True,
-        length=2,
-        is_interval=True,
-    ),
-    Parameter(
-        "safe_range.effort",
-        [-math.inf, math.inf],
         "alternate: a trial ends when the effort leaves it",
-        "the effort's unit",
         fixed=True,
-        length=2,
-        is_interval=True,
     ),
     Parameter(
         "settle_band",

@@ -44,14 +44,16 @@ def panels(case: Case, runs: Runs) -> list[Panel]:
     return [
         Panel(
             name,
-            [
-                Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance)
-                for label, run in under.items()
-            ],
+            [curve_of(label, run) for label, run in under.items()],
             limits,
         )
         for name, under in runs.items()
     ]
+
+
+def curve_of(label: str, run: Trajectory) -> Curve:
+    """A run of one lane as a picture's curve."""
+    return Curve(label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance)
 
 
 def tightest_limits(case: Case, gains: Gains) -> tuple[float, float]:
@@ -60,14 +62,25 @@ def tightest_limits(case: Case, gains: Gains) -> tuple[float, float]:
     return max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
 
 
-def control_cost(case: Case, episode: str, gains: Gains) -> dict[str, float | None]:
-    """What the control of an episode costs, as `analyze` calls it.
+def measured(case: Case, gains: Gains) -> dict[str, dict[str, Any]]:
+    """The metrics of both episodes, each with what its control costs, as `analyze` calls it: the sum of |Δu|, the
+    largest |u|, and for how much of the time the effort is at a limit.
 
-    Returns:
-        The sum of |Δu|, the largest |u|, and for how much of the time the effort is at a limit.
+    Raises:
+        PlanError, GainsError: the case's episodes are not what the metrics are of.
     """
-    effort = case.simulate(episode, gains).control_effort[:, 0]
-    use = effort_use(effort, tightest_limits(case, gains))
+    step = case.response("setpoint", gains)
+    tracking = asdict(case.setpoint_metrics(step.output[:, 0]))
+    push = case.response("disturbance", gains)
+    rejection = asdict(case.disturbance_metrics(push.output[:, 0]))
+    return {
+        "setpoint": tracking | _control_cost(case, gains, step),
+        "disturbance": rejection | _control_cost(case, gains, push),
+    }
+
+
+def _control_cost(case: Case, gains: Gains, run: Trajectory) -> dict[str, float | None]:
+    use = effort_use(run.control_effort[:, 0], tightest_limits(case, gains))
     at_limit = None if use.saturated_share is None else 100.0 * use.saturated_share
     return {"effort_variation": use.total_variation, "effort_peak": use.peak, "saturated_percent": at_limit}
 
@@ -78,13 +91,7 @@ def numbers(case: Case, of: Mapping[str, Gains]) -> list[list[str]]:
     Raises:
         PlanError, GainsError: the case's episodes are not what the metrics are of.
     """
-    found = {
-        label: {
-            "setpoint": asdict(case.setpoint_response(gains)) | control_cost(case, "setpoint", gains),
-            "disturbance": asdict(case.disturbance_response(gains)) | control_cost(case, "disturbance", gains),
-        }
-        for label, gains in of.items()
-    }
+    found = {label: measured(case, gains) for label, gains in of.items()}
     rows = [
         [title, *("-" if (v := each[episode][name]) is None else shown(name, v) for each in found.values())]
         for (episode, name), title in METRICS.items()

@@ -196,6 +196,8 @@ def by_place(track: Track) -> Track:
 
 def held(table: np.ndarray) -> np.ndarray:
     """The table with each NaN replaced by the value before it in its column; NaN before the first."""
+    if not np.isnan(table).any():
+        return table
     filled: np.ndarray = np.take_along_axis(table, latest_told(table), axis=0)
     return filled
 
@@ -216,7 +218,8 @@ def layouts_of(names: np.ndarray, values: np.ndarray) -> tuple[Layout, ...]:
     for keys, rows in _alike(names, values):
         mine = np.stack([values[row] for row in rows]) if values.dtype == object else values[rows]
         if keys:
-            found.append(Layout(keys, rows, np.where(np.isinf(mine), np.nan, mine)))
+            infinite = np.isinf(mine)
+            found.append(Layout(keys, rows, np.where(infinite, np.nan, mine) if infinite.any() else mine))
     return tuple(found)
 
 

@@ -25,7 +25,6 @@ from tdof_npid_ros.tuning import TuningError
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.experimenter import LoopAtWork
-    from tdof_npid_ros.graph.observer import Row
 
 MOST_EXPERIMENTS = 3
 GROWS = 1.5  # times larger is each experiment than the one before
@@ -152,7 +151,7 @@ def _trial(
     loop: LoopAtWork, work: Commissioning, design: Design, arguments: argparse.Namespace, say: Callable[[str], None]
 ) -> Confirmed:
     """Apply the gains, step the setpoint, compare, and keep or revert."""
-    from tdof_npid_ros.graph.experimenter import Hold, record_of
+    from tdof_npid_ros.graph.experimenter import Hold, record_of, signals_of
 
     rest = at_rest(loop, arguments)
     wanted = argparse.Namespace(**{**vars(arguments), "by": "setpoint", "size": None})
@@ -162,13 +161,13 @@ def _trial(
         hold.apply({**design.settings, "manual": False, "experiment_setpoint": base})
         hold.wait(SETTLES * design.horizon)
         before = hold.taken[-REST_SAMPLES:]
-        now = rest_of(*_signals(before), tolerance=0.0)
+        now = rest_of(*signals_of(before), tolerance=0.0)
         first, target = len(hold.taken), base + proposal.size
         hold.move(setpoint=target)
         hold.wait(settling_time(design, target - base))
         rows = hold.taken[first:]
         rows = rows[next((i for i, row in enumerate(rows) if row.setpoint[0] == target), 0) :]
-        y, _, r = _signals(rows)
+        y, _, r = signals_of(rows)
         times = [row.stamp_ns / 1e9 - rows[0].stamp_ns / 1e9 for row in rows]
         step = confirmed(
             design, times, r, y, [float(row.effort[0]) for row in rows], (now.output, now.effort), now.noise
@@ -190,14 +189,6 @@ def _trial(
         elif not arguments.yes:
             work.outcome, work.reason = "reverted", "the gains of before are on the controller"
     return step
-
-
-def _signals(rows: list[Row]) -> tuple[list[float], list[float], list[float]]:
-    return (
-        [float(row.output[0]) for row in rows],
-        [float((row.applied if len(row.applied) else row.effort)[0]) for row in rows],
-        [float(row.setpoint[0]) for row in rows],
-    )
 
 
 def _agreed(arguments: argparse.Namespace, question: str, meanwhile: Callable[[], None] | None = None) -> bool:

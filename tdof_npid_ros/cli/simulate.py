@@ -7,7 +7,7 @@ import csv
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from tdof_npid_ros.metrics import in_units
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.plotting import Panel, draw_responses
-from tdof_npid_ros.prediction import control_cost, gains_table, numbers, panels, shown, simulated
+from tdof_npid_ros.prediction import gains_table, measured, numbers, panels, shown, simulated
 from tdof_npid_ros.stability.margins import margins
 
 
@@ -110,12 +110,11 @@ def _page(case: Case, of: Mapping[str, Gains], drawn: Sequence[Panel]) -> Page:
 
 def response_report(case: Case, gains: Gains) -> dict[str, Any]:
     """Metrics of both episodes and the objective (10), as the contract's JSON object."""
-    setpoint, disturbance = case.setpoint_response(gains), case.disturbance_response(gains)
+    found = measured(case, gains)
     return {
         **loop_report(case, gains),
-        "setpoint": _without_empty_reason(asdict(setpoint)) | control_cost(case, "setpoint", gains),
-        "disturbance": _without_empty_reason(asdict(disturbance)) | control_cost(case, "disturbance", gains),
-        "objective": setpoint.iae + case.weight * disturbance.iae,
+        **{episode: _without_empty_reason(metrics) for episode, metrics in found.items()},
+        "objective": found["setpoint"]["iae"] + case.weight * found["disturbance"]["iae"],
     }
 
 

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,15 +65,20 @@ class Design:
     ms: float
 
     @property
-    def settings(self) -> dict[str, object]:
+    def settings(self) -> dict[str, Any]:
         """The controller's parameters to set."""
-        values = self.gains.as_dict()
-        return {name: values[name] for name in SET}
+        return settings_of(self.gains)
 
     @property
     def horizon(self) -> float:
         """s in which the loop has settled after a step."""
         return self.case.signals["setpoint"].steps * self.case.sample_period
+
+
+def settings_of(gains: Gains) -> dict[str, Any]:
+    """The controller's parameters that commissioning sets, by name."""
+    values = gains.as_dict()
+    return {name: values[name] for name in SET}
 
 
 def identified(records: Sequence[Record]) -> Identified:

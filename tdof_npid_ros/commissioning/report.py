@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from tdof_npid_ros.commissioning.confirm import Confirmed
-from tdof_npid_ros.commissioning.design import DRAWN, SET, Design
-from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.commissioning.design import DRAWN, SET, Design, settings_of
 from tdof_npid_ros.identification.records import Record
 from tdof_npid_ros.identification.result import as_json, table
 from tdof_npid_ros.interactive import Page, response_plots
 from tdof_npid_ros.plotting import Curve, Panel
+from tdof_npid_ros.prediction import curve_of
 from tdof_npid_ros.stability.margins import Margins
 
 BEFORE, NEW = "present gains", "new gains"
@@ -57,8 +57,8 @@ class Commissioning:
         if (design := self.design) is not None:
             report |= {
                 "model": as_json(design.found, design.draft),
-                "gains": _gains(design.gains),
-                "gains_before": _gains(design.case.gains),
+                "gains": settings_of(design.gains),
+                "gains_before": settings_of(design.case.gains),
                 "objective": design.objective,
                 "objective_before": design.objective_before if math.isfinite(design.objective_before) else None,
                 "margins": design.margins.as_dict(),
@@ -111,11 +111,7 @@ class Commissioning:
             for label, gains in ((BEFORE, design.case.gains), (NEW, design.gains)):
                 run = design.case.simulate(episode, gains)
                 if np.abs(run.output).max() < 1e3 * max(1.0, float(np.abs(run.setpoint).max())):
-                    curves.append(
-                        Curve(
-                            label, run.time, run.output[:, 0], run.control_effort[:, 0], run.setpoint, run.disturbance
-                        )
-                    )
+                    curves.append(curve_of(label, run))
             page.plot(*response_plots(Panel(episode, curves, design.case.effort_limits)))
         if (step := self.confirmed) is not None:
             page.heading("The confirming step")
@@ -141,7 +137,7 @@ def lines_of(design: Design) -> list[str]:
 
 
 def _compared(design: Design) -> list[Sequence[str]]:
-    before, new = _gains(design.case.gains), _gains(design.gains)
+    before, new = settings_of(design.case.gains), settings_of(design.gains)
     rows: list[Sequence[str]] = [("", BEFORE, NEW)]
     rows += [(name, _text(before[name]), _text(new[name])) for name in SET]
     rows.append(("objective", _text(design.objective_before), _text(design.objective)))
@@ -152,11 +148,6 @@ def _compared(design: Design) -> list[Sequence[str]]:
 
 def _margin(margins: Margins, name: str) -> str:
     return "unstable" if margins.stable is False else _text(getattr(margins, name))
-
-
-def _gains(gains: Gains) -> dict[str, Any]:
-    values = gains.as_dict()
-    return {name: values[name] for name in SET}
 
 
 def _text(value: Any) -> str:

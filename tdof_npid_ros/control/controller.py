@@ -263,24 +263,11 @@ class _Law:
         terms: np.ndarray,
     ) -> None:
         """One answer; state and shaping advance, effort and terms are written."""
-        if self._is_plain:
-            answer_lanes(
-                self._flat,
-                self._limits,
-                self._conditional,
-                self._unwinding,
-                self._low,
-                self._high,
-                setpoint,
-                output,
-                state,
-                effort,
-                terms,
-            )
-            return
-        shape_lanes(self.shape, setpoint, output, self.least, self.most, shaping, self._shaped, self._low, self._high)
-        integral = state[INTEGRAL].copy()
-        r, y = self._shaped
+        r, y = setpoint, output
+        if not self._is_plain:
+            shape_lanes(self.shape, r, y, self.least, self.most, shaping, self._shaped, self._low, self._high)
+            integral = state[INTEGRAL].copy()
+            r, y = self._shaped
         answer_lanes(
             self._flat,
             self._limits,
@@ -294,6 +281,8 @@ class _Law:
             effort,
             terms,
         )
+        if self._is_plain:
+            return
         if self.options.manual:
             state[INTEGRAL] = integral  # the law's is set when it takes over again
             np.minimum(np.maximum(self._manual, self._low), self._high, out=effort)

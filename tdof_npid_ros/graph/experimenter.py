@@ -17,7 +17,7 @@ from tdof_npid_ros.graph.observer import LoopObserver, Row
 from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, RefusedError
 from tdof_npid_ros.identification.excitation import By, Excitation, Rest, rest_of
 from tdof_npid_ros.identification.fit import Stretch
-from tdof_npid_ros.identification.records import EVEN, Record
+from tdof_npid_ros.identification.records import Record, is_even
 from tdof_npid_ros.interruption import afterwards, check
 from tdof_npid_ros.parameters import EXPERIMENT, GAINS
 
@@ -125,12 +125,7 @@ class LoopAtWork:
                 len(rows) >= LEAST_REST_SAMPLES and time.monotonic() - begun > 0.25 * patience
             )
             if enough:
-                found = rest_of(
-                    [float(row.output[0]) for row in rows],
-                    [float((row.applied if len(row.applied) else row.effort)[0]) for row in rows],
-                    [float(row.setpoint[0]) for row in rows],
-                    tolerance,
-                )
+                found = rest_of(*signals_of(rows), tolerance)
                 if found.is_rest:
                     return found
             if time.monotonic() > end:
@@ -277,6 +272,15 @@ class Hold:
         self._renew_at = time.monotonic() + 0.25 * LEASE
 
 
+def signals_of(rows: Sequence[Row]) -> tuple[list[float], list[float], list[float]]:
+    """Output, effort and setpoint of the answers; the effort that the plant applied, where it tells it."""
+    return (
+        [float(row.output[0]) for row in rows],
+        [float((row.applied if len(row.applied) else row.effort)[0]) for row in rows],
+        [float(row.setpoint[0]) for row in rows],
+    )
+
+
 def record_of(rows: Sequence[Row], name: str, number: int, limits: tuple[float, float]) -> Record:
     """Rows as a record for identification.
 
@@ -295,7 +299,5 @@ def record_of(rows: Sequence[Row], name: str, number: int, limits: tuple[float, 
         effort = np.append(until[1:], until[-1])
     else:
         effort = np.array([float(row.effort[0]) for row in kept])
-    steps = np.diff(time_)
-    even = bool(steps.max() - steps.min() <= 2e-9 + EVEN * steps.mean())
-    stretch = Stretch(time_, effort, output, False, float(effort[0]), even)
+    stretch = Stretch(time_, effort, output, False, float(effort[0]), is_even(time_))
     return Record(name, number, stretch, np.array([float(row.setpoint[0]) for row in kept]), limits)

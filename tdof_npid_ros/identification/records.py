@@ -139,13 +139,14 @@ def _records(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
         before, limits = _from_plant(loop, int(receive[0]))
         at_rest = label is not None and bool(known[0]) and stamps[0] == 0  # else it is met in the middle
         stretch = Stretch(
-            time, effort[known], y[known], at_rest, before if at_rest else float(effort[known][0]), _is_even(time)
+            time, effort[known], y[known], at_rest, before if at_rest else float(effort[known][0]), is_even(time)
         )
         name = names.get(label.plan, label.plan) if label is not None and label.plan else "recording"
         yield Record(name, number, stretch, setpoint[known], limits, tuple(note for note in notes if note))
 
 
-def _is_even(time: np.ndarray) -> bool:
+def is_even(time: np.ndarray) -> bool:
+    """Whether times (samples,), in s, lie on a grid, but for the rounding of stamps."""
     steps = np.diff(time)
     return bool(steps.max() - steps.min() <= 2e-9 + EVEN * steps.mean())
 

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdof_npid_ros.case import Case
+from tdof_npid_ros.case import EPISODES, Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.paper.evaluation import paper_case, published_gains
 from tdof_npid_ros.paper.tables import Published
-from tdof_npid_ros.tuning.problem import EPISODES
 
 PERIOD_NS = 10_000_000
 LIMIT = 15.0  # of the Sprott circuit's effort

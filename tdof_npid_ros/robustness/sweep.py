@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tdof_npid_ros.case import Case
+from tdof_npid_ros.case import EPISODES, Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.loop import LARGEST_BLOCK, LARGEST_OUTPUT, VECTOR
 from tdof_npid_ros.plants.linear import TransferFunction
@@ -26,7 +26,6 @@ METRICS: Final = {
     "objective": "IAE_SP + w·IAE_DIS",
     "m_s": "M_s",
 }
-EPISODES: Final = ("setpoint", "disturbance")
 
 CHUNK = 512  # plants: some tenths of a second, and a few MB
 FAN_LANES = 400  # plants whose responses the picture is made of: the first ones

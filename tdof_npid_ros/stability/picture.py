@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdof_npid_ros.case import Case
+from tdof_npid_ros.case import EPISODES, Case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.plotting import GUIDE, new_figure, save, style
 from tdof_npid_ros.stability import StabilityError
@@ -22,7 +22,6 @@ HEIGHT, WIDTH = 4.2, 4.6  # inches of one set of axes
 REACH = 3.0  # largest magnitude of L that the Nyquist picture shows
 USUAL_M_S = 2.0
 DECADES = 3.0  # below the crossover that the sensitivities are shown
-EPISODES = ("setpoint", "disturbance")  # whose outputs are the step responses
 
 
 def draw_margins(case: Case, gains: Gains, found: Margins, path: Path, title: str) -> None:

@@ -12,10 +12,10 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tdof_npid_ros.case import EPISODES
 from tdof_npid_ros.loop import LARGEST_OUTPUT, Integrals
 from tdof_npid_ros.scenario import SampledPlan
 from tdof_npid_ros.tuning.ask_tell import Array
-from tdof_npid_ros.tuning.problem import EPISODES
 from tdof_npid_ros.wire import EpisodeLabel
 
 Indices = NDArray[np.intp]

@@ -10,10 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from tdof_npid_ros.case import EPISODES
 from tdof_npid_ros.control.gains import gains_from_candidates
 from tdof_npid_ros.loop import VECTOR, Integrals, joined
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
-from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
+from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.workers import Workers, available_cores
 
 LARGEST_IAE = 1e30
@@ -41,10 +42,8 @@ def scores(problem: TuningProblem, candidates: Array, setpoint: Integrals, distu
     With perturbed plants the integrals are (n * plants,): first those of the first candidate with all plants.
     """
     gains = gains_from_candidates(problem.base, problem.names, candidates)
-    if problem.perturbed:
-        values = objective_values(setpoint, disturbance, problem.weight)
-        return problem.plants_judge(gains, values, setpoint, disturbance)
-    return problem.judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
+    judge = problem.plants_judge if problem.perturbed else problem.judge
+    return judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
 
 
 def _cost(integrals: Integrals) -> Array:

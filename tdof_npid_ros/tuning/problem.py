@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tdof_npid_ros.case import Bounds, Case
+from tdof_npid_ros.case import EPISODES, Bounds, Case
 from tdof_npid_ros.control.gains import TUNED, ControllerType, Gains, GainsError
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameters import TUNER, WEIGHT
@@ -22,9 +22,6 @@ from tdof_npid_ros.tuning.ask_tell import Array
 from tdof_npid_ros.tuning.judge import DIVERGED, LARGEST_TAIL, UNSTABLE, Constraints, Judge
 from tdof_npid_ros.tuning.perturbed import Perturbed, PlantsJudge
 from tdof_npid_ros.tuning.space import Space
-
-EPISODES = ("setpoint", "disturbance")
-"""IAE_SP and IAE_DIS of the objective (10) are those of these episodes of the case."""
 
 POPULATION, GENERATIONS = 40, 200
 """By default: Jin & Jarso's (2024) population, for 8,000 evaluations."""

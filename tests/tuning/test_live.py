@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import EPISODES, load_case
 from tdof_npid_ros.control.gains import gains_from_candidates
 from tdof_npid_ros.loop import Integrals
 from tdof_npid_ros.tuning import TuningError
@@ -16,7 +16,7 @@ from tdof_npid_ros.tuning.alternate import StepTest, Trial
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.live import EpisodeOutputs, LoopLostError, integrals_of, measure, work_of_loops
 from tdof_npid_ros.tuning.objective import Objective, scores
-from tdof_npid_ros.tuning.problem import EPISODES, TuningProblem
+from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.wire import EpisodeLabel
 
 SHORT = {"setpoint": ("0 setpoint 1", "5 end"), "disturbance": ("0 disturbance 1", "5 end")}
