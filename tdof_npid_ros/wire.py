@@ -121,6 +121,7 @@ class _Order(NamedTuple):
 
 _ORDERS: Final = {b"\0\0": _Order.of(">"), b"\0\1": _Order.of("<")}  # plain CDR, by its first two bytes
 _OWN_HEAD: Final = b"\0\1" if sys.byteorder == "little" else b"\0\0"
+_OWN_START: Final = _OWN_HEAD + b"\0\0"
 _OWN: Final = _ORDERS[_OWN_HEAD]
 
 
@@ -143,12 +144,12 @@ class Sample(NamedTuple):
 
 
 class SignalReader:
-    """Reads the messages of one topic, whose frame and names are mostly as in the message before."""
+    """Reads the messages of one topic, whose frame, names and numbers of values are mostly as in the message before."""
 
     def __init__(self) -> None:
-        self._head = self._labels = b"?"  # no message before this one
         self._order = _OWN
-        self._end = sys.maxsize  # of the labels
+        self._fixed: tuple[tuple[bytes, int], ...] = ((b"?", 0),)  # what does not change, and where; none so far
+        self._values: tuple[tuple[int, int], ...] = ()  # of position, velocity, effort: how many, and where
         self._frame_id = ""
         self._name: tuple[str, ...] = ()
 
@@ -159,28 +160,26 @@ class SignalReader:
             ValueError: it is not a JointState in plain CDR, or its stamp has a second of more than 1e9 ns.
         """
         try:
-            if not (data.startswith(self._head) and data.startswith(self._labels, _LABELS)):
-                self._read_labels(data)
-            seconds, nanoseconds = self._order.stamp.unpack_from(data, _STAMP)
+            for part, at in self._fixed:
+                if not data.startswith(part, at):
+                    self._lay_out(data)
+                    break
+            order = self._order
+            seconds, nanoseconds = order.stamp.unpack_from(data, _STAMP)
             if nanoseconds >= SECOND:
                 raise ValueError
-            position, at = self._values(data, self._end)
-            velocity, at = self._values(data, at)
-            effort, at = self._values(data, at)
+            position, velocity, effort = [
+                np.frombuffer(data, order.float, count, at).astype(np.float64) if count else NO_VALUES
+                for count, at in self._values
+            ]
         except (struct.error, ValueError, KeyError):
             raise ValueError(f"its {len(data)} bytes are not a valid JointState in plain CDR") from None
         return Sample(seconds * SECOND + nanoseconds, self._frame_id, self._name, position, velocity, effort)
 
-    def _values(self, data: bytes, at: int) -> tuple[np.ndarray, int]:
-        (count,) = self._order.length.unpack_from(data, at)
-        if not count:
-            return NO_VALUES, at + 4
-        at += 4 + -at % 8
-        return np.frombuffer(data, self._order.float, count, at).astype(np.float64), at + 8 * count
-
-    def _read_labels(self, data: bytes) -> None:
-        head = data[:2]
-        length = _ORDERS[head].length
+    def _lay_out(self, data: bytes) -> None:
+        """Find where everything is in this message, and in those like it."""
+        order = _ORDERS[data[:2]]
+        length = order.length
         frame_id, at = _string(data, _LABELS, length)
         (count,) = length.unpack_from(data, at)
         at += 4
@@ -188,7 +187,16 @@ class SignalReader:
         for _ in range(count):
             word, at = _string(data, at, length)
             name.append(word)
-        self._head, self._order, self._labels, self._end = head, _ORDERS[head], data[_LABELS:at], at
+        fixed, values, end = [(data[:2], 0)], [], _LABELS
+        for _ in range(3):
+            (count,) = length.unpack_from(data, at)
+            at += 4
+            if count:
+                at += -(at - _STAMP) % 8
+            fixed.append((data[end:at], end))
+            values.append((count, at))
+            at = end = at + 8 * count
+        self._order, self._fixed, self._values = order, tuple(fixed), tuple(values)
         self._frame_id, self._name = frame_id, tuple(name)
 
 
@@ -202,7 +210,7 @@ def _string(data: bytes, at: int, length: struct.Struct) -> tuple[str, int]:
 
 
 class SignalWriter:
-    """Writes messages that have frame and names in common."""
+    """Writes messages that have frame and names in common, and mostly the numbers of values."""
 
     def __init__(self) -> None:
         self.label("", ())
@@ -210,6 +218,7 @@ class SignalWriter:
     def label(self, frame_id: str, name: Sequence[str]) -> None:
         """What header.frame_id and name are from now on."""
         self._labels = b"".join([_string_bytes(frame_id), _OWN.length.pack(len(name)), *map(_string_bytes, name)])
+        self._lay_out((0, 0, 0))
 
     def write(
         self,
@@ -219,16 +228,34 @@ class SignalWriter:
         effort: np.ndarray = NO_VALUES,
     ) -> bytes:
         """The serialized message with these values: float64 of any shape, written in C order, or empty."""
-        parts = [_OWN_HEAD, b"\0\0", _OWN.stamp.pack(*divmod(stamp_ns, SECOND)), self._labels]
-        at = _LABELS + len(self._labels)
-        for values in (position, velocity, effort):
-            count = values.size
-            parts.append(_OWN.length.pack(count))
+        counts = position.size, velocity.size, effort.size
+        if counts != self._counts:
+            self._lay_out(counts)
+        before_position, before_velocity, before_effort = self._fixed
+        return b"".join(
+            (
+                _OWN_START,
+                _OWN.stamp.pack(*divmod(stamp_ns, SECOND)),
+                before_position,
+                position.tobytes(),
+                before_velocity,
+                velocity.tobytes(),
+                before_effort,
+                effort.tobytes(),
+            )
+        )
+
+    def _lay_out(self, counts: tuple[int, int, int]) -> None:
+        """What stands before position, velocity and effort, of which there are so many values."""
+        fixed, at, before = [], _LABELS, self._labels
+        for count in counts:
+            before += _OWN.length.pack(count)
             if count:
-                parts += (bytes(-at % 8), values.tobytes())
-                at += -at % 8 + 8 * count
-            at += 4
-        return b"".join(parts)
+                before += bytes(-(at + len(before) - _STAMP) % 8)
+            fixed.append(before)
+            at += len(before) + 8 * count
+            before = b""
+        self._counts, self._fixed = counts, tuple(fixed)
 
 
 def _string_bytes(text: str) -> bytes:
