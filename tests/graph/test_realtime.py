@@ -20,6 +20,7 @@ SOAK_SECONDS = float(os.environ.get("TDOF_SOAK_SECONDS", "20"))
 WARM_UP_SECONDS = min(60.0, SOAK_SECONDS / 2)
 
 
+@pytest.mark.alone
 def test_figures_and_speed(graph: Any) -> None:
     """At speed 5, 100 Hz of simulated time are 500 ticks a second; none is made up, none is lost."""
     from rosgraph_msgs.msg import Clock
@@ -154,6 +155,7 @@ def test_in_realtime_each_episode_begins_with_the_configured_plant(graph: Any) -
     assert graph.fresh_fact("/scenario", "rejected") == "1"
 
 
+@pytest.mark.alone
 def test_soak_at_200_hz(graph: Any) -> None:
     """No answer is missed and memory stays flat; TDOF_SOAK_SECONDS=600 is the long version."""
     live = Live(graph, "/soak", {"sample_period": 0.005}, {"sample_period": 0.005})

@@ -232,9 +232,8 @@ def test_a_supervisor_records_bag_after_bag(graph: Any, tmp_path: Path) -> None:
     for number in range(3):
         with BagReader(tmp_path / f"bag{number}") as reader:
             total = sum(topic.count for topic in reader.topics.values())
-            assert (
-                reader.custom_data["recorded"] == str(total - snapshots(reader)) and reader.custom_data["lost"] == "0"
-            )
+            account = reader.custom_data
+            assert account["recorded"] == str(total - snapshots(reader)) and account["lost"] == "0", account
             assert reader.topics["/output"].count > 50
         assert verify(tmp_path / f"bag{number}").different == 0
 

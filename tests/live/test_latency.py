@@ -9,7 +9,7 @@ import pytest
 from browser import chromium_page
 from live_program import CHROMIUM, Program, eventually, needs_chromium
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.timeout(240), pytest.mark.alone]
 LATEST_S = 0.2
 STEPS = 20  # of the effort, in a round
 # A machine that is busy with something else may be late; a page that is late is so in every round, at most steps.
