@@ -277,7 +277,7 @@ class Session:
         self._answer_label = AnswerLabel("")  # of the latest answer
         self._answered = NO_VALUES  # the latest output that was
         self._arrival_ns: int | None = None
-        self._common = np.zeros(self.controller.lanes)
+        self._common, self._on_lanes = 0.0, np.zeros(self.controller.lanes)
         self._repeats = 0  # outputs since the latest one with a stamp of its own
         self._measured_from_ns, self._intervals, self._off = 0, 0, 0
 
@@ -405,12 +405,12 @@ class Session:
 
     def _compare_periods(self, place: Place) -> tuple[str, str]:
         """In lockstep outputs come every sample period; if not, plant and controller were given different ones."""
-        assert self.stamp_ns is not None
-        apart_ns, period_ns = place.stamp_ns - self.stamp_ns, self.controller.sample_period_ns
+        assert self.sequence.latest is not None
+        apart_ns, period_ns = place.stamp_ns - self.sequence.latest.stamp_ns, self.controller.sample_period_ns
         self.is_out_of_step = apart_ns != period_ns
-        return (
-            (OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s") if self.is_out_of_step else _FINE
-        )
+        if not self.is_out_of_step:
+            return _FINE
+        return OUT_OF_STEP, f": it is {apart_ns / 1e9:g} s and {period_ns / 1e9:g} s"
 
     def _measure_from(self, place: Place) -> None:
         self._measured_from_ns, self._intervals, self._off = place.stamp_ns, 0, 0
@@ -461,9 +461,9 @@ class Session:
 
     def _on_every_lane(self, setpoint: float) -> np.ndarray:
         """A setpoint for every lane, (lanes,); the same array as long as it is the same."""
-        if setpoint != self._common[0] or len(self._common) != self.controller.lanes:
-            self._common = np.full(self.controller.lanes, setpoint)
-        return self._common
+        if setpoint != self._common or len(self._on_lanes) != self.controller.lanes:
+            self._common, self._on_lanes = setpoint, np.full(self.controller.lanes, setpoint)
+        return self._on_lanes
 
     def _applied(self, output: Sample) -> np.ndarray | None:
         """The effort that the output reports, (lanes,); None if it reports none."""
