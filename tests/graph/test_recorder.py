@@ -228,6 +228,7 @@ def test_a_supervisor_records_bag_after_bag(graph: Any, tmp_path: Path) -> None:
         assert not graph.set_parameters("/recorder", bag=str(tmp_path / "other"))[0].successful
         graph.wait_for_nodes("/recorder")
         graph.wait_until(lambda: int(graph.fact("/recorder", "recorded", 0)) > 200, what="messages to be recorded")
+        graph.wait_until(lambda: int(graph.fact("/recorder", "parameters_of", 0)) >= 3, what="the nodes' parameters")
         assert graph.change_state("/recorder", "deactivate")
     for number in range(3):
         with BagReader(tmp_path / f"bag{number}") as reader:

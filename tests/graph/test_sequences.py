@@ -30,7 +30,18 @@ def test_losses_and_what_was_missed(counts: list[int], lost: int, missed: int, a
     seen = Sequences()
     for first in range(0, len(counts), at_once):
         seen.take(counts[first : first + at_once])
-    assert (seen.lost, seen.missed) == (lost, missed)
+    assert (seen.lost(), seen.missed) == (lost, missed)
+
+
+def test_the_first_message_of_a_publisher_that_was_not_heard_before_shows_no_loss() -> None:
+    """Nothing came of the first publisher since: the second one's count may go on from it, after a gap, or not."""
+    seen = Sequences()
+    seen.take([6, 7, 9])
+    assert seen.lost(publishers=2) == 0 and seen.lost(publishers=1) == 1
+    seen.take([10, 13])
+    assert seen.lost(publishers=2) == 1  # one of the two gaps is a loss, the smaller one at least
+    seen.take([8])  # so the count of 9 was the second one's
+    assert seen.lost(publishers=2) == 2
 
 
 def test_three_publishers_with_losses_interleaved_at_random() -> None:
@@ -44,4 +55,4 @@ def test_three_publishers_with_losses_interleaved_at_random() -> None:
         next_[publisher] += gap
         seen.take([next_[publisher]])
         next_[publisher] += 1
-    assert lost > 10 * REMEMBERED / 3 and seen.lost == lost
+    assert lost > 10 * REMEMBERED / 3 and seen.lost(publishers=3) == lost

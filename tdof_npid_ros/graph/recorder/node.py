@@ -88,6 +88,7 @@ class RecorderNode(LoopNode):
         self.lost_by_topic: Counter[str] = Counter()  # on taps that were closed
         self.missed_by_topic: Counter[str] = Counter()  # published before the recorder came
         self.not_recorded: set[str] = set()
+        self.explained: set[str] = set()  # nodes whose parameters are in the bag
 
     def activate(self) -> None:
         """Open the bag and subscribe."""
@@ -267,6 +268,8 @@ class RecorderNode(LoopNode):
             writer.write(self._topic_id(writer, tap), data, time.time_ns(), asked_ns)
         except BagError as error:
             self._fail(error)
+            return
+        self.explained.add(event.node)
 
     def _fail(self, error: BagError) -> None:
         """Say so at once, and let go of the topics: a reader that does not read would hold the loop up."""
@@ -309,7 +312,12 @@ class RecorderNode(LoopNode):
     def state(self) -> tuple[int, str, dict[str, object]]:
         """What is recorded where, and what went wrong."""
         losses = self._losses()
-        facts: dict[str, object] = {"bag": self.folder, "topics": len(self.taps), "lost": losses.total()}
+        facts: dict[str, object] = {
+            "bag": self.folder,
+            "topics": len(self.taps),
+            "parameters_of": len(self.explained),
+            "lost": losses.total(),
+        }
         if self.failure:
             return ERROR, self.failure, facts
         if losses:

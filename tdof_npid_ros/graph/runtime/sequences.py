@@ -29,7 +29,8 @@ class Sequences:
     """The counts of a topic's messages: each is by 1 larger than the one before of the same publisher.
 
     Which publisher has sent a message, the middleware does not say. So a count that goes on from no other counts as one
-    after a gap, until what seems to be missing comes all the same: then it was another publisher's.
+    after a gap, until what seems to be missing comes all the same: then it was another publisher's. As long as fewer
+    publishers have been heard than there are, it may as well be the first that came of another one's.
 
     Attributes:
         missed: messages that publishers had sent before the first that came of theirs.
@@ -37,13 +38,14 @@ class Sequences:
 
     def __init__(self) -> None:
         self.missed = 0
+        self._heard = 0  # publishers
         self._final = 0
         self._runs: list[_Run] = []  # that which went on last is the last one
 
-    @property
-    def lost(self) -> int:
-        """Messages that are missing between others."""
-        return self._final + sum(run.gap for run in self._runs)
+    def lost(self, publishers: int = 1) -> int:
+        """Messages that are missing between others, of so many publishers."""
+        gaps = sorted((run.gap for run in self._runs if run.before), reverse=True)
+        return self._final + sum(gaps[max(publishers - self._heard, 0) :])
 
     def take(self, counts: Sequence[int]) -> None:
         """Take what has come, in order; 0 is a count that is not known."""
@@ -62,6 +64,7 @@ class Sequences:
             for other in self._runs:
                 if other.before is run:  # this one goes on by itself
                     other.before = None
+                    self._heard += 1
                     self.missed += other.first - 1
             self._runs.remove(run)
             self._runs.append(run)
@@ -69,6 +72,7 @@ class Sequences:
         earlier = [run for run in self._runs if run.next < count] if count > 1 else []
         before = max(earlier, key=lambda run: run.next, default=None)
         if before is None:
+            self._heard += 1
             self.missed += count - 1
         self._runs.append(_Run(count, before))
         if len(self._runs) > REMEMBERED:

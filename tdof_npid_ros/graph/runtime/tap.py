@@ -56,6 +56,7 @@ class Tap:
         self.received = 0
         self._sequences = Sequences()
         self._reported_lost = 0
+        self._publishers = 1  # at most so far
         self.type_name = type_name
         self._node = node
         self._type = message_class(type_name)
@@ -80,7 +81,8 @@ class Tap:
         for event in self._subscription.event_handlers:
             event._ready_to_take_data = True  # what an executor's wait set would have said
             self._reported_lost = event.take_data().total_count
-        return max(self._reported_lost, self._sequences.lost)
+        self._publishers = max(self._publishers, self._node.count_publishers(self.topic))
+        return max(self._reported_lost, self._sequences.lost(self._publishers))
 
     def take(self) -> list[Taken]:
         """What has come since the last look, in order."""
