@@ -242,6 +242,7 @@ def _alike(names: np.ndarray, values: np.ndarray) -> list[tuple[tuple[Key, ...],
 
 
 def _keys(names: Sequence[str], count: int) -> tuple[Key, ...]:
+    names = [name.rstrip("\0") for name in names]  # of drivers that copy texts of fixed length
     is_place = all(name == f"{NAMED_LANE}{i}" for i, name in enumerate(names))
     if len(names) == count and not is_place and len(set(names)) == count and all(names):
         return tuple(names)

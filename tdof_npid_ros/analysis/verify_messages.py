@@ -101,7 +101,8 @@ def _check_signal(reader: BagReader, loop: Loop, name: str, field: str, account:
         others = sum(
             len(getattr(signal, other)[step]) for other in ("position", "velocity", "effort") if other != field
         )
-        same = planned and values.size and not others and all(value.tobytes() in _bytes(planned) for value in values)
+        more = others or signal.frame_id[step]
+        same = planned and values.size and not more and all(value.tobytes() in _bytes(planned) for value in values)
         recorded, expected = tuple(values.tolist()), tuple(sorted(planned)) or ("nothing at this time",)
         account.note(SIGNALS, None if same else Difference(name, topic, step, stamp_ns, "", {}, recorded, expected))
 

@@ -93,11 +93,19 @@ def _decode_texts(raw: NDArray[np.uint8]) -> Column:
     messages, size = raw.shape
     if size == 0:
         return np.full(messages, "", "U1")
+    if not raw[:, -1].all():  # NumPy's strings would lose zeros at their end
+        return _as_objects([bytes(row).decode() for row in raw])
     if (raw < 0x80).all():
         return raw.astype(np.uint32).view(f"U{size}")[:, 0]
     joined = np.ascontiguousarray(raw).view(f"V{size}")[:, 0].tolist()
     decoded = {text: text.decode() for text in set(joined)}
     return np.array([decoded[text] for text in joined])
+
+
+def _as_objects(texts: list[str]) -> Column:
+    column = np.empty(len(texts), object)
+    column[:] = texts
+    return column
 
 
 def _text_extractor(span: Span) -> _Extract:

@@ -174,6 +174,14 @@ def test_columns_hold_what_single_messages_hold(contents, little_endian) -> None
             assert_array_equal(columns[field][row], message[field])
 
 
+def test_zeros_at_the_end_of_a_string_are_kept() -> None:
+    """As drivers send them that copy texts of fixed length; NumPy's own strings would lose them."""
+    messages = [joint_state(0, frame, ["elbow\0\0", "wrist"], [1.0, 2.0]) for frame in ("", "\0", "a\0\0", "base")]
+    columns = columns_of(JOINT_STATE, messages)
+    assert columns["header.frame_id"].tolist() == ["", "\0", "a\0\0", "base"]
+    assert [list(names) for names in columns["name"]] == [["elbow\0\0", "wrist"]] * 4
+
+
 def test_several_bags_are_one(tmp_path) -> None:
     write_bag(tmp_path / "first", 100)
     write_bag(tmp_path / "second", 100)
