@@ -28,8 +28,11 @@ from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …
 LONGEST_GAP_PERIODS = 1000  # … but a slow loop has its time
 LONGEST_HELD = 10  # periods that an output stands in for those that are not in the bag
+TO_AND_FRO = 10  # messages in a row that go to and fro between two values: of two publishers
+TO_AND_FRO_SIZE = 0.05  # of all that the output moves; less may be an encoder's last digit
 TURN = 2 * np.pi
 TURNED = 0.9  # of a turn, between two outputs: not the way that a joint has gone
+TWO_SOURCES = "of two publishers, or of a clock that was set back: these outputs are left out"
 UNPLANNED = "recording"  # the name of an episode without a plan
 ANSWERS_BY_STAMP = 0.5  # of the efforts bear an output's stamp: then they are answers to outputs
 
@@ -265,7 +268,13 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
     grid = _grid(stamps, period_ns, plan, loop.bag)
     hold = not digest
     sampling = _Sampling(grid, period_ns, output, stamps, first, hold)
-    y = sampling.outputs(output.table(keys))
+    table = output.table(keys)
+    torn = (
+        []
+        if view.label is not None
+        else [lane for lane in range(len(keys)) if _mixed_values_left_out(output, table[:, lane])]
+    )
+    y = sampling.outputs(table)
     effort = sampling.of_answers(loop.effort, view.answers, keys)
     start_ns = int(output.receive_ns[0])
     used = _used(loop, view.answers, known)
@@ -315,7 +324,11 @@ def _episode(view: _View, count: int, known: Mapping[str, Configuration], names:
         from_rest=from_rest,
         largest_step=_largest_step(loop, period_ns, plant, y, turn, start_ns),
         turn=tuple(TURN if lane in angles else turn for lane in range(len(keys))),
-        notes=(*loop.notes, *(f"{_called(keys[lane])} turns over at its end: measured as an angle" for lane in angles)),
+        notes=(
+            *loop.notes,
+            *(f"{_called(keys[lane])} turns over at its end: measured as an angle" for lane in angles),
+            *(f"{_called(keys[lane])} goes to and fro between two values: {TWO_SOURCES}" for lane in torn),
+        ),
         hint=loop.hint,
     )
 
@@ -403,6 +416,35 @@ class _Sampling(NamedTuple):
         is_new = latest > self.output.receive_ns[0] - self.period_ns
         hold = self._replace(hold=True)
         return hold.by_stamp(self.stamps, rows[self.first]), is_new
+
+
+def _mixed_values_left_out(output: Track, values: np.ndarray) -> bool:
+    """Whether an output's values (messages,), or some of them, are those of two sources, so that no one knows which are
+    meant; these become NaN in place."""
+    order = np.argsort(output.stamp_ns, kind="stable")
+    order = order[~np.isnan(values[order])]
+    mixed = of_two_sources(output.stamp_ns[order], values[order])
+    values[order[mixed]] = np.nan
+    return bool(mixed.stop)
+
+
+def of_two_sources(stamps: np.ndarray, values: np.ndarray) -> slice:
+    """From the first to the last of the messages (messages,) that come in turn from two sources: each second value
+    lies far off, and each second interval is another.
+
+    >>> stamps = np.arange(40) * 10 + np.tile([0, 3], 20)
+    >>> of_two_sources(stamps, np.tile([0.0, 1.0], 20)), of_two_sources(stamps, np.arange(40.0))
+    (slice(0, 40, None), slice(0, 0, None))
+    """
+    if len(values) < TO_AND_FRO + 2:
+        return slice(0, 0)
+    moves, intervals = np.abs(np.diff(values)), np.diff(stamps)
+    away = np.minimum(moves[:-1], moves[1:])
+    back = np.abs(values[2:] - values[:-2])
+    uneven = np.abs(np.diff(intervals)) > 0.1 * (intervals[:-1] + intervals[1:])
+    jumps = (away > 10 * back) & (away > TO_AND_FRO_SIZE * np.ptp(values)) & uneven
+    runs = np.flatnonzero(np.convolve(jumps, np.ones(TO_AND_FRO), "valid") == TO_AND_FRO)
+    return slice(int(runs[0]), int(runs[-1]) + TO_AND_FRO + 2) if runs.size else slice(0, 0)
 
 
 def _used(loop: ObservedLoop, answers: np.ndarray, known: Mapping[str, Configuration]) -> list[Configuration]:

@@ -188,7 +188,8 @@ def _possible_outputs(reader: BagReader, bag: str) -> list[Source]:
     if not possible:
         raise AnalysisError(
             f"{bag}: no output in it that can be told by its name: choose one with --output TOPIC:FIELD; its topics "
-            f"are {told_topics(reader) or 'none'}" + "".join(f"; missing: {line}" for line in reader.missing)
+            f"are {told_topics(reader) or 'none'}"
+            + "".join(f"; missing: {line}" for line in (*reader.missing, *reader.left_out))
         )
     return possible
 

@@ -155,8 +155,8 @@ def states(reader: BagReader, role: Role) -> list[Source]:
 
 
 def told_topics(reader: BagReader, without: Collection[str] = ()) -> str:
-    """The bag's topics that can be read, with their types, for messages; empty if there are none but `without`."""
-    without = {*without, *reader.unreadable}
+    """The bag's topics with messages that can be read, and their types; empty if there are none but `without`."""
+    without = {*without, *reader.unreadable, *(topic for topic, info in reader.topics.items() if not info.count)}
     told = [f"{topic} ({info.type})" for topic, info in sorted(reader.topics.items()) if topic not in without]
     more = f" and {len(told) - _MOST_TOLD} more" if len(told) > _MOST_TOLD else ""
     return ", ".join(told[:_MOST_TOLD]) + more

@@ -14,6 +14,7 @@ from tdof_npid_ros.bag.errors import BagError, choices, shown
 SQLITE: Final = ".db3"
 _MOST_LINES: Final = 50  # about files that are not read
 _SUFFIXES: Final = (".mcap", SQLITE)
+_OTHERS: Final = (".bag", ".zstd", ".zst", ".lz4", ".gz")  # of which opening them says what to do
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,14 @@ def _check_compression(path: Path, information: Mapping[str, Any]) -> None:
 
 def _all_files(path: Path) -> tuple[Path, ...]:
     try:
-        files = [file for file in path.iterdir() if file.suffix in _SUFFIXES and file.is_file()]
+        there = [file for file in path.iterdir() if file.is_file()]
     except OSError as error:
         raise BagError(f"cannot open {path}: {error.strerror}: give a bag folder or a file") from None
-    if not files:
-        raise BagError(f"{path}: no .mcap or .db3 file in it: give a bag folder or a file")
-    return tuple(sorted(files, key=_by_number))
+    for suffixes in (_SUFFIXES, _OTHERS):
+        files = sorted((file for file in there if file.suffix in suffixes), key=_by_number)
+        if files:
+            return tuple(files)
+    raise BagError(f"{path}: no .mcap or .db3 file in it: give a bag folder or a file")
 
 
 def _by_number(file: Path) -> list[tuple[int, str]]:

@@ -63,7 +63,8 @@ class RecoveryReport:
         found = [f"{self.destination}: {total} messages recovered, up to {self.last_ns / 1e9:.9f} s"]
         for topic in sorted(self.messages.keys() | self.missing_messages.keys()):
             found.append(f"  {shown(topic)}: {self.messages.get(topic, 0)}{self._gaps(topic)}")
-        found.append(f"missing: {self.dropped_bytes} bytes" if self.missing else "nothing is missing")
+        lost = f" {self.dropped_bytes} bytes" if self.dropped_bytes else ""
+        found.append(f"missing:{lost}" if self.missing else "nothing is missing")
         found.extend(f"  {one_line(line)}" for line in self.missing)
         if self.mended:
             found.append("damaged, but read:")

@@ -70,7 +70,9 @@ class TopicInfo:
         if self.problem:
             raise BagError(self.problem)
         if self.encoding not in CDR_DEFINITIONS:
-            raise BagError(f"its messages are in {shown(self.encoding) or 'no known encoding'}, not in CDR")
+            is_ros1 = self.encoding == "ros1"
+            advice = ": convert the ROS 1 bag with `rosbags-convert` (pip install rosbags)" if is_ros1 else ""
+            raise BagError(f"its messages are in {shown(self.encoding) or 'no known encoding'}, not in CDR{advice}")
         if self.encoding == ROS2MSG and self.definition.strip():
             return parse(self.type, self.definition)
         try:

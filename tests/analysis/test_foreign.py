@@ -147,7 +147,43 @@ def test_messages_without_joints_do_not_matter(tmp_path) -> None:
     assert is_the_step(by_joint(analyze([bag]))["a"][0])
 
 
+def test_names_may_be_padded_with_zeros(tmp_path) -> None:
+    told = setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    (response,) = by_joint(analyze([write(tmp_path / "bag", measured({"a\0\0": STEP}) + told)]))["a"]
+    assert is_the_step(response)
+
+
 # Nothing invented
+
+
+@pytest.mark.parametrize("offset_ns", [0, 4_000_000])
+def test_outputs_of_one_joint_from_two_publishers_have_no_metrics(tmp_path, offset_ns) -> None:
+    """A robot and its simulation, for example."""
+    half = lambda t: STEP(t) / 2  # noqa: E731
+    bag = measured({"a": STEP, "b": STANDS}) + [
+        (t + 1000, *of) for t, *of in measured({"a": half}, offset_ns=offset_ns)
+    ]
+    report = analyze([write(tmp_path / "bag", bag + setpoints([(0, {"a": 0, "b": 5}), (1, {"a": 1, "b": 5})]))])
+    found = by_joint(report)
+    assert (found["a"][0].metrics, found["a"][0].iae) == (None, None) and found["b"][0].iae == 0.0
+    assert "a goes to and fro between two values: of two publishers" in report.table()
+
+
+def test_the_last_digit_of_an_encoder_may_go_to_and_fro(tmp_path) -> None:
+    digit = lambda t: STEP(t) + 1e-3 * (round(t * 100) % 2)  # noqa: E731
+    bag = [(t + t // H_NS % 2 * 3_000_000, *of) for t, *of in measured({"a": digit}, stamp=lambda _: 0)]
+    report = analyze([write(tmp_path / "bag", bag + setpoints([(0, {"a": 0}), (1, {"a": 1})]))])
+    (response,) = by_joint(report)["a"]
+    assert response.iae == pytest.approx(TAU, rel=0.02)
+
+
+def test_a_joint_may_come_late_or_leave(tmp_path) -> None:
+    late = [m for m in measured({"a": STEP, "late": follows(1.0, [(3.0, 2.0)])}) if m[0] >= 2 * 10**9]
+    early = [m for m in measured({"a": STEP, "leaves": STANDS}) if m[0] < 2 * 10**9]
+    told = setpoints([(0, {"a": 0, "late": 1, "leaves": 5}), (1, {"a": 1}), (3, {"late": 2, "leaves": 6})])
+    found = by_joint(analyze([write(tmp_path / "bag", early + late + told)]))
+    assert is_the_step(found["a"][0]) and is_the_step(found["late"][0])
+    assert found["leaves"][0].metrics is None and "outputs are missing" in str(found["leaves"][0].reason)
 
 
 def test_before_a_first_setpoint_there_is_none(tmp_path) -> None:

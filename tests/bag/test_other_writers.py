@@ -17,6 +17,8 @@ from mcap.records import Message as Record
 from mcap.writer import Writer
 from numpy.testing import assert_array_equal
 
+from tdof_npid_ros.analysis import AnalysisError
+from tdof_npid_ros.analysis.report import analyze
 from tdof_npid_ros.bag import BagError, records
 from tdof_npid_ros.bag.qos import QosProfile
 from tdof_npid_ros.bag.reader import BagReader
@@ -301,6 +303,29 @@ def test_other_files_are_refused_with_what_to_do(tmp_path, name, content, advice
     (tmp_path / name).write_bytes(content)
     with pytest.raises(BagError, match=advice):
         BagReader(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "advice"),
+    [("a.bag", b"#ROSBAG V2.0\n" + bytes(5000), "rosbags-convert"), ("a.mcap.zstd", zstd(TEN), "zstd -d")],
+)
+def test_a_folder_of_other_files_is_refused_with_what_to_do(tmp_path, name, content, advice) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(BagError, match=advice):
+        BagReader(tmp_path)
+
+
+def test_messages_of_ros_1_are_left_out_with_what_to_do(tmp_path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros1")
+        number = writer.register_schema("std_msgs/Float64", "ros1msg", b"float64 data")
+        writer.add_message(writer.register_channel("/x", "ros1", number), 1, bytes(8), 1)
+        writer.finish()
+    with BagReader(tmp_path / "a.mcap") as reader:
+        assert "in ros1, not in CDR: convert the ROS 1 bag with `rosbags-convert`" in reader.unreadable["/x"]
+    with pytest.raises(AnalysisError, match="its topics are none; missing: 1 messages: topic /x cannot be decoded"):
+        analyze([tmp_path / "a.mcap"])
 
 
 def folder_with(tmp_path, listed: list[str]):

@@ -202,6 +202,13 @@ def test_a_damaged_file_among_several_is_named(tmp_path) -> None:
     assert any("bag_2.mcap, which is not there" in line for line in report.missing)
 
 
+def test_where_no_bytes_are_missing_but_a_file_none_are_told(tmp_path) -> None:
+    write_bag(tmp_path / "bag", 5000, max_bytes=100_000, compression="none", flush_interval_s=60)
+    (tmp_path / "bag" / "bag_2.mcap").unlink()
+    lines = recover(tmp_path / "bag", tmp_path / "new").lines()
+    assert "bag_2.mcap, which is not there" in lines[lines.index("missing:") + 1]
+
+
 def test_nothing_is_written_where_something_is(tmp_path) -> None:
     write_bag(tmp_path / "bag", 10)
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
