@@ -2,6 +2,7 @@
 
 MODULES = (
     "loop_speed", "tuning", "tuning_time", "test_functions", "lockstep", "live_tuning", "recorder", "writer",
-    "reader", "realtime", "startup", "memory", "growth", "fleet", "margins", "identification", "robust", "cluster",
+    "reader", "realtime", "startup", "memory", "growth", "fleet", "live_page", "margins", "identification",
+    "robust", "cluster",
 )  # fmt: skip
 LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only

@@ -9,6 +9,16 @@ from typing import Any
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
            "--disable-component-update", "--disable-sync"]  # fmt: skip
+# On the live page: of each value of the effort, when its first sample was there, in ms since 1970.
+WATCH_EFFORT = """
+(() => {
+  window.seen = {}
+  const source = [...Bokeh.documents[0].all_models].find((m) => m.name === "effort+applied")
+  source.streaming.connect(() => {
+    for (const value of source.data.effort) if (!(value in window.seen)) window.seen[value] = Date.now()
+  })
+})()
+"""
 
 
 @contextmanager

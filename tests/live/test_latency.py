@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from browser import chromium_page
+from browser import WATCH_EFFORT, chromium_page
 from live_program import CHROMIUM, Program, eventually, needs_chromium
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.alone]
@@ -15,16 +15,6 @@ STEPS = 20  # of the effort, in a round
 # A machine that is busy with something else may be late; a page that is late is so in every round, at most steps.
 ROUNDS, MOST_LATE = 5, 2
 PERIOD_S = 0.01
-# Of each value of the effort, when its first sample was on the page, in ms since 1970.
-WATCH = """
-(() => {
-  window.seen = {}
-  const source = [...Bokeh.documents[0].all_models].find((m) => m.name === "effort+applied")
-  source.streaming.connect(() => {
-    for (const value of source.data.effort) if (!(value in window.seen)) window.seen[value] = Date.now()
-  })
-})()
-"""
 
 
 @needs_chromium
@@ -56,7 +46,7 @@ def test_a_step_is_shown_within_200_ms(tmp_path: Path) -> None:
         with chromium_page(CHROMIUM) as page:
             page.goto(program.url, timeout=60_000)
             page.wait_for_function("window.Bokeh && Bokeh.documents[0]?.is_idle", timeout=60_000)
-            page.evaluate(WATCH)
+            page.evaluate(WATCH_EFFORT)
             eventually(lambda: run(0.1, 0.0) or page.evaluate("0 in window.seen"), "the loop is seen")
             late: list[list[float]] = []
             for number in range(ROUNDS):

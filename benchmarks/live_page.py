@@ -1,0 +1,180 @@
+"""What the live page costs, and how soon it shows what happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from benchmarks.harness import Result, Verdict, main, processor_seconds, resident_mib, ros_environment, summary
+from tdof_npid_ros.graph.conductor import Conductor
+from tdof_npid_ros.graph.processes import NodeProcesses
+from tests.browser import WATCH_EFFORT, chromium_page
+
+TITLE = "The live page"
+METHOD = (
+    "`tdof-npid live --join` of a loop, its page in a headless Chromium on the same two cores, which also draws it. "
+    "*Step seen*: outputs with their efforts are published at 100 Hz, the effort stepping ten times a second; the time "
+    "from the publishing of a step's first effort until the page's data hold it. *Ticks missed*: plant and controller "
+    "in realtime at 100 Hz, by the plant's own count, in windows with nothing else running and with program, page and "
+    "browser, in turn."
+)
+PEERS = ("bokeh", "playwright")
+NOTES: tuple[str, ...] = ()
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NAMESPACE, SCRIPTED = "/bench_page", "/bench_steps"
+PERIOD = 0.01  # s
+HELD = 0.1  # s that a step of the effort lasts
+TIMEOUT = 90.0  # s
+
+
+def run(size: str) -> Result:
+    """First the steps, then the ticks."""
+    if CHROMIUM is None:
+        return Result(notes=["Not measured: there is no Chromium on this machine."])
+    ros_environment(88)
+    steps, rounds, window = (100, 3, 12.0) if size == "full" else (5, 1, 2.0)
+    result = Result()
+    seen = _steps_seen(steps)
+    result.rates.append(summary("a step of the effort, until the page holds it", "ms", seen, ours=True))
+    result.verdicts += [
+        Verdict(
+            f"time until a step is in the browser, 95 % of {steps}, ms", _quantile(seen, 0.95), 200.0, at_most=True
+        ),
+        Verdict("the same, the latest, ms", seen[-1], None),
+    ]
+    alone, beside, processor, memory = 0, 0, [], []
+    with _loop() as conductor:
+        for _ in range(rounds):
+            alone += _missed(conductor, window)
+            with _page(NAMESPACE) as (program, _):
+                before, begin = processor_seconds(program.pid), time.monotonic()
+                beside += _missed(conductor, window)
+                processor.append(100.0 * (processor_seconds(program.pid) - before) / (time.monotonic() - begin))
+                memory.append(resident_mib(program.pid))
+    ticks = round(rounds * window / PERIOD)
+    result.rates += [
+        summary("tdof-npid live, of one processor", "%", processor, ours=True),
+        summary("tdof-npid live, resident", "MiB", memory, ours=True),
+    ]
+    result.verdicts += [
+        Verdict(
+            f"ticks missed with the page, of {ticks:,}, more than without it", max(0, beside - alone), 0, at_most=True
+        )
+    ]
+    result.notes.append(f"Ticks missed of {ticks:,}: {alone} without the page, {beside} with it.")
+    return result
+
+
+def _quantile(ordered: list[float], q: float) -> float:
+    return ordered[min(len(ordered) - 1, round(q * len(ordered)))]
+
+
+def _steps_seen(steps: int) -> list[float]:
+    """Of each step, how long until the page held it, in ms, in order."""
+    import rclpy
+    from sensor_msgs.msg import JointState
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("loop", namespace=SCRIPTED, context=context)
+    publishers = {topic: node.create_publisher(JointState, topic, 10) for topic in ("output", "control_effort")}
+    published: dict[float, float] = {}
+
+    def hold(value: float, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            message = JointState()
+            message.header.stamp = node.get_clock().now().to_msg()
+            message.position, message.effort = [value], [value]
+            publishers["output"].publish(message)
+            published.setdefault(value, time.time())
+            publishers["control_effort"].publish(message)
+            time.sleep(PERIOD)
+
+    def seen() -> dict[float, float]:
+        return {float(value): at / 1000.0 for value, at in page.evaluate("Object.entries(window.seen)")}
+
+    try:
+        with _page(SCRIPTED) as (_, page):
+            page.evaluate(WATCH_EFFORT)
+            end = time.monotonic() + TIMEOUT
+            while not seen():
+                if time.monotonic() > end:
+                    raise TimeoutError("the page does not show the loop")
+                hold(0.0, HELD)
+            for step in range(steps):
+                hold(1.0 + step, HELD)
+            hold(0.5, 1.0)  # for what is on its way
+            at = seen()
+            return sorted(1000.0 * (at[1.0 + step] - published[1.0 + step]) for step in range(steps))
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+@contextmanager
+def _loop() -> Iterator[Conductor]:
+    """Plant and controller in realtime, as processes of their own."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "bench.yaml"
+        file.write_text(
+            f"/**: {{ros__parameters: {{sample_period: {PERIOD}, mode: realtime}}}}\n"
+            "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, sigma: 1.0, setpoint: 1.0}}\n"
+        )
+        with NodeProcesses(file, NAMESPACE) as nodes:
+            conductor = Conductor(NAMESPACE, nodes.check)
+            try:
+                nodes.start("controller")
+                nodes.start("plant")
+                conductor.wait(lambda: conductor.fact("plant", "output_to_effort_p50_us") != "", "the loop", TIMEOUT)
+                yield conductor
+            finally:
+                conductor.close()
+
+
+def _missed(conductor: Conductor, seconds: float) -> int:
+    """Ticks that the plant misses in so many seconds."""
+    before = _report(conductor)
+    time.sleep(seconds)  # an onlooker that spins would take its share of the processors
+    return _report(conductor) - before
+
+
+def _report(conductor: Conductor) -> int:
+    """The ticks missed since the plant's start, by a report from now on."""
+    told = {conductor.fact("plant", "time_s")}
+    for _ in range(2):  # the first may have waited to be taken
+        conductor.wait(lambda: conductor.fact("plant", "time_s") not in told, "the plant's report", TIMEOUT)
+        told.add(conductor.fact("plant", "time_s"))
+    return int(conductor.fact("plant", "missed_ticks") or 0)
+
+
+@contextmanager
+def _page(namespace: str) -> Iterator[tuple[subprocess.Popen[str], Any]]:
+    """`tdof-npid live` of a loop, and its page in a browser, as Playwright has it."""
+    assert CHROMIUM is not None
+    command = [sys.executable, "-m", "tdof_npid_ros", "live", "--join", namespace, "--no-browser", "--json"]
+    with subprocess.Popen(command, env=dict(os.environ), stdout=subprocess.PIPE, text=True) as program:
+        try:
+            assert program.stdout is not None
+            url = str(json.loads(program.stdout.readline())["url"])
+            with chromium_page(CHROMIUM) as page:
+                page.goto(url, timeout=1000.0 * TIMEOUT)
+                page.wait_for_function("window.Bokeh && Bokeh.documents[0]?.is_idle", timeout=1000.0 * TIMEOUT)
+                yield program, page
+        finally:
+            program.send_signal(signal.SIGINT)
+
+
+if __name__ == "__main__":
+    main("live_page")
