@@ -88,7 +88,9 @@ def run(size: str) -> Result:
 
 def _environment(extra: dict[str, str] | None = None) -> dict[str, str]:
     environment = {**os.environ, **(extra or {}), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "86"}
-    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    # The second: else each start would compile our modules anew, and those of the other packages not.
+    for name in ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONDONTWRITEBYTECODE"):
+        environment.pop(name, None)
     return environment
 
 

@@ -37,9 +37,14 @@ def chromium_page(program: str, width: int = 1280, height: int = 900, **context:
             **context,
         )
         page = browser.new_page()
-        page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        page.on("request", lambda request: _is_foreign(request.url) and troubles.append(f"fetched {request.url}"))
+
+        def complain(of: bool, text: str) -> None:
+            if of:
+                troubles.append(text)
+
+        page.on("console", lambda message: complain(message.type == "error", message.text))
+        page.on("pageerror", lambda error: complain(True, str(error)))
+        page.on("request", lambda request: complain(_is_foreign(request.url), f"fetched {request.url}"))
         yield page
         browser.close()
     assert not troubles, troubles
