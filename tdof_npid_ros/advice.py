@@ -18,7 +18,7 @@ from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.linearise import linearised
 from tdof_npid_ros.plants.ode import Ode
 from tdof_npid_ros.plants.plant import PlantError
-from tdof_npid_ros.stability.margins import margins
+from tdof_npid_ros.stability.margins import margins, one_lane
 
 Severity = Literal["error", "warning", "hint"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "hint")
@@ -51,11 +51,8 @@ class Advice(NamedTuple):
         return f"{self.about}: {self.text}: {self.remedy}"
 
 
-def advice(case: Case, runs: dict[str, Trajectory] | None = None) -> list[Advice]:
-    """All that is to be said of a case, the gravest first.
-
-    Args:
-        runs: its episodes simulated, if they are there already.
+def advice(case: Case) -> list[Advice]:
+    """All that is to be said of a case, the gravest first; of each lane where each has a plant of its own.
 
     Example:
         >>> from tdof_npid_ros.case import load_case
@@ -63,11 +60,17 @@ def advice(case: Case, runs: dict[str, Trajectory] | None = None) -> list[Advice
         ['hint']
     """
     found: list[Advice] = []
+    if len(case.alone) > 1:
+        for lane, alone in enumerate(case.alone):
+            gains = one_lane(case.gains, min(lane, case.gains.lanes - 1))
+            its = advice(replace(alone, gains=gains))
+            found += [one._replace(about=f"lane {lane}, {one.about}") for one in its]
+        return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
     for look in LOOKS_AT_THE_FILE:
         found += look(case)
     if not any(one.severity == "error" for one in found):
-        runs = {name: case.simulate(name) for name in case.plans} if runs is None else runs
-        for name, run in runs.items():
+        for name in case.plans:
+            run = case.simulate(name)
             found += [*_episode(case, name, run), *_accuracy(case, name, run)]
     return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
 

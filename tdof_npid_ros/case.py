@@ -19,11 +19,18 @@ from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameter import Table
 from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
 from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
-from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant, model_table, named_model
+from tdof_npid_ros.plants.catalog import (
+    changeable_parameters,
+    effort_limits,
+    make_plant,
+    model_table,
+    named_model,
+    values_of_lanes,
+)
 from tdof_npid_ros.plants.noise import largest_noise, noiseless
 from tdof_npid_ros.plants.ode import class_by_value, take_class
 from tdof_npid_ros.plants.per_lane import LanePlants, lane_plants
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import Plant, one_plant
 from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
@@ -79,8 +86,18 @@ class Case:
 
     @cached_property
     def plant(self) -> Plant:
-        """The plant as configured, without the noise of what is measured."""
-        return noiseless(self.plant_at({}))
+        """The plant as configured, without the noise of what is measured.
+
+        Raises:
+            PlantError: each lane has its own.
+        """
+        return one_plant(noiseless(self.plant_at({})))
+
+    @cached_property
+    def alone(self) -> list[Case]:
+        """The case with each lane's plant alone, where each lane has its own; else the case."""
+        values = values_of_lanes(self.model, self.plant_values)
+        return [self] if values is None else [replace(self, plant_values=one) for one in values]
 
     @property
     def noise_bound(self) -> float:
@@ -88,7 +105,7 @@ class Case:
         return largest_noise(self.plant_at({}))
 
     def plant_at(self, changes: Mapping[str, float]) -> Plant:
-        """The plant with some parameters changed."""
+        """The plant with some parameters changed; an `EachLane` where each lane has its own."""
         return make_plant(self.model, {**self.plant_values, **changes})
 
     def parameters(self, gains: Gains | None = None) -> dict[str, dict[str, Any]]:
@@ -111,7 +128,7 @@ class Case:
         Raises:
             PlanError: a line is wrong; the message names the episode and the line.
         """
-        changeable = changeable_parameters(self.model, self.plant_values)
+        changeable = changeable_parameters(self.model)
         plans = {}
         for name, lines in self.episodes.items():
             try:
@@ -133,8 +150,8 @@ class Case:
         """
         steps = [0.0]
         for signals in self.signals.values():
-            first = self.plant.initial_output if signals.start is None else signals.start
-            steps.append(float(np.abs(np.diff(signals.setpoint, prepend=first)).max()))
+            for first in self._first_outputs(signals):
+                steps.append(float(np.abs(np.diff(signals.setpoint, prepend=first)).max()))
         return max(steps)
 
     @cached_property
@@ -143,9 +160,13 @@ class Case:
         band of the recovery is a fraction of."""
         moves = [0.0]
         for signals in self.signals.values():
-            first = self.plant.initial_output if signals.start is None else signals.start
-            moves.append(largest_move(signals.setpoint, first, self.options.turn))
+            for first in self._first_outputs(signals):
+                moves.append(largest_move(signals.setpoint, first, self.options.turn))
         return max(moves)
+
+    def _first_outputs(self, signals: SampledPlan) -> set[float]:
+        """With which the lanes begin."""
+        return {one.plant.initial_output for one in self.alone} if signals.start is None else {signals.start}
 
     def lane_plants(self, episode: str, changes: Sequence[Mapping[str, Any]]) -> LanePlants:
         """A plant of its own for each lane of an episode: the case's with these parameters changed.
@@ -160,7 +181,7 @@ class Case:
         """Run an episode in process; gains for one lane or many, by default the case's.
 
         Args:
-            plants: of the lanes, from `lane_plants`; None: all have the case's.
+            plants: of the lanes, from `lane_plants`; None: the case's, one for all or for each its own.
 
         Raises:
             PlanError: the case has no such episode.
@@ -170,7 +191,7 @@ class Case:
             raise PlanError(f"{self.name} has no episode {episode!r}: its scenario's episodes are {known}")
         gains, signals = gains or self.gains, self.signals[episode]
         if self.options.is_plain:
-            return loop.simulate(plants or self.plant_at, gains, signals, self.effort_limits)
+            return loop.simulate(plants or self._plants(episode), gains, signals, self.effort_limits)
         if plants is not None:
             raise self._not_the_law_alone("lanes with plants of their own run")
         return loop.simulate_operated(self.plant_at, gains, self.options, signals, self.effort_limits)
@@ -179,7 +200,12 @@ class Case:
         """Run an episode in process and keep only its integrals; arguments as for `simulate`."""
         if not self.options.is_plain:
             raise self._not_the_law_alone("tuning runs")
-        return loop.integrals(plants or self.plant_at, gains, self.signals[episode], self.effort_limits)
+        return loop.integrals(plants or self._plants(episode), gains, self.signals[episode], self.effort_limits)
+
+    def _plants(self, episode: str) -> loop.Plants:
+        if len(self.alone) == 1:
+            return self.plant_at
+        return lane_plants([one.plant_at for one in self.alone], self.signals[episode], self.effort_limits)
 
     def _not_the_law_alone(self, who: str) -> GainsError:
         return GainsError(
@@ -231,6 +257,7 @@ class Case:
             raise GainsError(
                 f"{self.name}: the gains are for {lanes} lanes, but metrics are of one: give one number each"
             )
+        _ = self.plant  # refuses where each lane has its own
         return self.simulate(episode, gains)
 
     def _held(self, episode: str) -> tuple[float, float]:
@@ -345,7 +372,7 @@ def _case_of(name: str, nodes: Mapping[str, Mapping[str, Any]], folder: Path | N
         options=options_from_mapping(controller),
         search=tuner,
     )
-    _ = case.plant, case.plans
+    _ = [one.plant for one in case.alone], case.plans
     case = _with_scale(case, "sigma" in controller)
     for node, values in nodes.items():
         for warning in misspelt(values, tables[node]):

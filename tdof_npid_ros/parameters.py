@@ -292,14 +292,16 @@ CONTROLLER: Final = table(
 
 
 def _time_constant(default: float, description: str) -> Parameter:
-    return Parameter("time_constant", default, description, "s", ABOVE_0_FINITE)
+    return Parameter("time_constant", default, description, "s", ABOVE_0_FINITE, per_lane=True)
 
 
 def _dead_time(default: float) -> Parameter:
-    return Parameter("dead_time", default, "dead time, any number", "s", Range(0.0, 1e9), fixed=True)
+    return Parameter("dead_time", default, "dead time, any number", "s", Range(0.0, 1e9), fixed=True, per_lane=True)
 
 
-_GAIN: Final = Parameter("gain", 1.0, "gain K of the transfer function", "output per effort unit", FINITE)
+_GAIN: Final = Parameter(
+    "gain", 1.0, "gain K of the transfer function", "output per effort unit", FINITE, per_lane=True
+)
 OFFSETS: Final = table(  # a linear model's operating point
     Parameter(
         "output_offset",
@@ -308,8 +310,11 @@ OFFSETS: Final = table(  # a linear model's operating point
         "the output's unit",
         FINITE,
         fixed=True,
+        per_lane=True,
     ),
-    Parameter("effort_offset", 0.0, "effort that holds it there", "the effort's unit", FINITE, fixed=True),
+    Parameter(
+        "effort_offset", 0.0, "effort that holds it there", "the effort's unit", FINITE, fixed=True, per_lane=True
+    ),
 )
 MODELS: Final[dict[str, dict[str, Parameter]]] = {
     "first_order": table(  # (11)
@@ -327,7 +332,9 @@ MODELS: Final[dict[str, dict[str, Parameter]]] = {
     "third_order": table(  # (13)
         _GAIN,
         _time_constant(1.0, "all three time constants T"),
-        Parameter("zero_time_constant", 1.0, "c of the zero in the right half-plane, 1 - c s", "s", FINITE),
+        Parameter(
+            "zero_time_constant", 1.0, "c of the zero in the right half-plane, 1 - c s", "s", FINITE, per_lane=True
+        ),
         _dead_time(0.0),
         *OFFSETS.values(),
     ),
@@ -338,9 +345,9 @@ MODELS: Final[dict[str, dict[str, Parameter]]] = {
         *OFFSETS.values(),
     ),
     "sprott": table(  # (14)-(16)
-        Parameter("a", 0.6, "a of the circuit", within=FINITE),
-        Parameter("b", 1.2, "b of the circuit", within=FINITE),
-        Parameter("c", 2.0, "c of the circuit", within=FINITE),
+        Parameter("a", 0.6, "a of the circuit", within=FINITE, per_lane=True),
+        Parameter("b", 1.2, "b of the circuit", within=FINITE, per_lane=True),
+        Parameter("c", 2.0, "c of the circuit", within=FINITE, per_lane=True),
         Parameter("initial_state", [0.0, 0.0, 0.0], "x1, x2, x3 at time 0", within=FINITE, length=3, fixed=True),
     ),
 }
@@ -376,7 +383,7 @@ PLANT: Final = table(
     Parameter(
         "lanes",
         1,
-        "independent copies of the plant in one message; taken over at the next reset",
+        "plants in one message, independent of each other; taken over at the next reset",
         within=Range(1, 100_000),
         of_loop=True,
     ),

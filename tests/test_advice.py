@@ -113,3 +113,12 @@ def test_an_integration_that_is_unstable_is_an_error(
     path.write_text(FAST % (substeps, substeps))
     found = [one for one in advice(load_case(path)) if one.about == "substeps"]
     assert [one.severity for one in found] == ([severity] if severity else [])
+
+
+def test_each_lane_with_a_plant_of_its_own_is_advised_of() -> None:
+    case = load_case("p1-c0.5")
+    lanes = replace(case, plant_values={**case.plant_values, "gain": [1.0, 5.0]})
+    assert [(one.severity, one.about) for one in advice(lanes)] == [
+        ("error", "lane 1, gains"),
+        ("hint", "lane 0, gains"),
+    ]

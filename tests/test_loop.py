@@ -3,6 +3,7 @@ local)."""
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from tdof_npid_ros.control.gains import ANTI_WINDUP, CONTROLLER_TYPES, Gains
 from tdof_npid_ros.loop import integrals, simulate
 from tdof_npid_ros.paper.tables import CASES
 from tdof_npid_ros.plants.lockstep import Episode
+from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
+from tdof_npid_ros.robustness.spread import spreads_of
 from tdof_npid_ros.scenario import parse_plan
 from tdof_npid_ros.wire import EpisodeLabel
 
@@ -34,7 +37,7 @@ def shortened(case: Case) -> Case:
 
 def stepped(case: Case, episode: str, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
     """The episode as the nodes run it: plant and controller apart, one step at a time."""
-    simulator = PlantSimulator(case.plant, case.sample_period_ns, gains.lanes, case.effort_limits)
+    simulator = PlantSimulator(case.plant_at({}), case.sample_period_ns, gains.lanes, case.effort_limits)
     run = Episode(case.plans[episode], simulator, case.plant_at, EpisodeLabel(case.plans[episode].digest, "a", 1))
     controller = Controller(gains, case.sample_period_ns)
     outputs, efforts, running = [], [], True
@@ -59,6 +62,39 @@ def test_stepping_gives_the_bits_of_the_compiled_loop(name: str, kind: str) -> N
             outputs, efforts = stepped(case, episode, gains)
             np.testing.assert_array_equal(outputs, trajectory.output)
             np.testing.assert_array_equal(efforts, trajectory.control_effort)
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [
+        ("p1-c4", {"gain": [1.0, 1.2, 0.9], "time_constant": [4.0, 5.0, 6.0], "dead_time": [0.0, 0.203, 4.0]}),
+        ("p1-c4", {"gain": [1.0, 1.2, 0.9], "noise": 0.01, "noise_seed": 3}),
+        ("sprott", {"a": [0.6, 0.7, 0.8], "b": [1.2, 1.1, 1.0]}),
+    ],
+)
+def test_stepping_lanes_with_a_plant_each_gives_the_bits_of_the_compiled_loop(name: str, own: dict[str, Any]) -> None:
+    case = shortened(load_case(name))
+    case = dataclasses.replace(case, plant_values={**case.plant_values, **own})
+    several = case.gains.with_values(kp=tuple(case.gains.kp * f for f in (1.0, 0.9, 0.5)))  # type: ignore[operator]
+    for episode in case.episodes:
+        trajectory = case.simulate(episode, several)
+        outputs, efforts = stepped(case, episode, several)
+        np.testing.assert_array_equal(outputs, trajectory.output)
+        np.testing.assert_array_equal(efforts, trajectory.control_effort)
+        assert len(np.unique(outputs[-1])) == 3
+    alone = case.alone[1].simulate("setpoint", case.gains.with_values(kp=several.per_lane("kp")[1]))
+    np.testing.assert_array_equal(alone.output[:, 0], case.simulate("setpoint", several).output[:, 1])
+
+
+def test_what_is_of_one_plant_refuses_a_case_with_several_in_one_line() -> None:
+    case = load_case("p1-c4")
+    case = dataclasses.replace(case, plant_values={**case.plant_values, "gain": [1.0, 2.0]})
+    for refuses in (case.setpoint_response, lambda: case.plant, lambda: spreads_of(case, ["gain 1 %"])):
+        with pytest.raises(PlantError, match="each of 2 lanes has a plant of its own") as error:
+            refuses()
+        assert "\n" not in str(error.value)
+    with pytest.raises(PlantError, match="gain has 2 values, but dead_time has 3"):
+        dataclasses.replace(case, plant_values={**case.plant_values, "dead_time": [0.1, 0.2, 0.3]}).simulate("setpoint")
 
 
 @pytest.mark.parametrize("name", ["p1-c4", "p2-c2", "p3-c1", "sprott"])

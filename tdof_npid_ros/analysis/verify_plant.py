@@ -15,6 +15,7 @@ from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.parameters import PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import changeable_parameters, effort_limits, make_plant
 from tdof_npid_ros.plants.lockstep import Episode
+from tdof_npid_ros.plants.per_lane import initial_lanes
 from tdof_npid_ros.plants.plant import Plant, PlantAt, PlantError
 from tdof_npid_ros.plants.simulator import PlantSimulator
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
@@ -221,7 +222,7 @@ def _plant_maker(values: Values) -> PlantAt:
 
     def plant_at(changes: dict[str, float]) -> Plant:
         model = str(values["model"])
-        unknown = [name for name in changes if name not in changeable_parameters(model, values)]
+        unknown = [name for name in changes if name not in changeable_parameters(model)]
         if unknown:
             raise PlantError(f"the plan changes {unknown[0]}, which it does not have")
         return make_plant(model, {**values, **changes})
@@ -232,7 +233,7 @@ def _plant_maker(values: Values) -> PlantAt:
 def _at_start(values: Values, lanes: int) -> set[bytes]:
     """What the plant applies before the first effort comes, by its bytes: none, limited or not, or one to rest with."""
     low, high = effort_limits(values)
-    without, resting = np.zeros(lanes), np.full(lanes, _resting_effort(values))
+    without, resting = np.zeros(lanes), _resting_efforts(values, lanes)
     return {without.tobytes(), *(np.minimum(np.maximum(one, low), high).tobytes() for one in (without, resting))}
 
 
@@ -250,14 +251,15 @@ def _allowed(values: Values, recorded: list[tuple[int, np.ndarray]], lanes: int)
     return found
 
 
-def _resting_effort(values: Values) -> float:
-    """The effort with which the plant begins, at rest; 0 where it is not known."""
+def _resting_efforts(values: Values, lanes: int) -> np.ndarray:
+    """The efforts with which the lanes begin, at rest, (lanes,); 0 where they are not known."""
     try:
         plant = make_plant(str(values.get("model", PLANT["model"].default)), values)
         start = float(values.get("start", math.inf))
-        return (plant.at_rest(start) if math.isfinite(start) else plant).initial_effort
+        begun = plant.at_rest(start) if math.isfinite(start) else plant
+        return initial_lanes(begun, lanes)[2]
     except (PlantError, TypeError):
-        return 0.0
+        return np.zeros(lanes)
 
 
 def _is_between(applied: np.ndarray, values: Values, recorded: list[tuple[int, np.ndarray]]) -> bool:

@@ -12,7 +12,7 @@ from tdof_npid_ros.parameters import MODELS, NOISE, OFFSETS, PLANT
 from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.noise import NoisyPlant
 from tdof_npid_ros.plants.ode import Ode, Sprott, class_table, load_class, loaded_class
-from tdof_npid_ros.plants.plant import Plant, PlantError
+from tdof_npid_ros.plants.plant import EachLane, Plant, PlantError
 
 
 def model_table(model: str) -> dict[str, Parameter]:
@@ -52,17 +52,13 @@ def model_parameters(model: str) -> dict[str, float | list[float]]:
     return {name: parameter.default for name, parameter in model_table(model).items()}
 
 
-def changeable_parameters(model: str, values: Mapping[str, Any]) -> dict[str, float]:
-    """The parameters of a model that may change while the loop runs, with their values.
-
-    Args:
-        values: as configured; what is not given has its default.
+def changeable_parameters(model: str) -> list[str]:
+    """The parameters of a model that may change while the loop runs.
 
     Raises:
         PlantError: no such model.
     """
-    its = model_table(model).items()
-    return {name: float(values.get(name, one.default)) for name, one in its if not (one.fixed or one.is_list)}
+    return [name for name, one in model_table(model).items() if not (one.fixed or one.is_list)]
 
 
 def effort_limits(values: Mapping[str, Any]) -> tuple[float, float]:
@@ -80,12 +76,39 @@ def effort_limits(values: Mapping[str, Any]) -> tuple[float, float]:
     return low, high
 
 
+def values_of_lanes(model: str, values: Mapping[str, Any]) -> list[dict[str, Any]] | None:
+    """The parameters of each lane's plant; None if all have the same, as no parameter has a list for the lanes.
+
+    Raises:
+        PlantError: no such model, or lists of different length.
+    """
+    names = [name for name, one in model_table(model).items() if one.per_lane and _is_list(values.get(name))]
+    if not names:
+        return None
+    lanes = len(values[names[0]])
+    for name in names:
+        if len(values[name]) != lanes or not lanes:
+            raise PlantError(
+                f"{names[0]} has {lanes} values, but {name} has {len(values[name])}: give one number, or one per lane"
+            )
+    return [{**values, **{name: float(values[name][lane]) for name in names}} for lane in range(lanes)]
+
+
+def _is_list(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, (str, bytes, Mapping))
+
+
 def make_plant(model: str, values: Mapping[str, Any]) -> Plant:
     """The plant of a model, with noise where it has any; what is not given keeps its default, others are passed over.
 
+    Where parameters have a list of numbers, one for each lane, it is an `EachLane`.
+
     Raises:
-        PlantError: no such model, or a parameter of the wrong type or range.
+        PlantError: no such model, or a parameter of the wrong type or range, or lists of different length.
     """
+    lanes = values_of_lanes(model, values)
+    if lanes is not None:
+        return EachLane(tuple(make_plant(model, one) for one in lanes))
     plant = _make_plant(model, values)
     try:
         noise, quantum, seed = (one.checked(values.get(name, one.default)) for name, one in NOISE.items())

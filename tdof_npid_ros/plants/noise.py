@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from tdof_npid_ros.plants.kernels import SampledNoisy, measured
-from tdof_npid_ros.plants.plant import Plant
+from tdof_npid_ros.plants.plant import EachLane, Plant
 
 LARGEST_NOISE: Final = 6.0  # standard deviations; no noise is larger
 
@@ -71,11 +71,15 @@ class NoisyPlant:
 
 def largest_noise(plant: Plant) -> float:
     """How far a measured output is from the plant's at the most, in the output's unit."""
+    if isinstance(plant, EachLane):
+        return max(map(largest_noise, plant.plants))
     return LARGEST_NOISE * plant.noise + 0.5 * plant.quantum if isinstance(plant, NoisyPlant) else 0.0
 
 
 def noiseless(plant: Plant) -> Plant:
     """The plant itself, without the noise of what is measured."""
+    if isinstance(plant, EachLane):
+        return EachLane(tuple(map(noiseless, plant.plants)))
     return plant.plant if isinstance(plant, NoisyPlant) else plant
 
 

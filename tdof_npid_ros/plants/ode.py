@@ -299,6 +299,7 @@ def class_table(description: Any) -> dict[str, Parameter]:
             float(value),
             str(texts.get(name, f"parameter of {description.__qualname__}")),
             within=_range(name, ranges[name]) if name in ranges else FINITE,
+            per_lane=True,
         )
         for name, value in description.parameters.items()
     ]

@@ -24,7 +24,7 @@ from tdof_npid_ros.plants.kernels import (
 )
 from tdof_npid_ros.plants.linear import TransferFunction, sampled_lanes
 from tdof_npid_ros.plants.noise import NoisyPlant, first_measured, noiseless
-from tdof_npid_ros.plants.plant import Plant, PlantAt, PlantError
+from tdof_npid_ros.plants.plant import EachLane, Plant, PlantAt, PlantError
 from tdof_npid_ros.plants.start import plant_at_start
 from tdof_npid_ros.plants.states import loaded
 from tdof_npid_ros.scenario import SampledPlan
@@ -111,10 +111,49 @@ class LanePlants:
 
     def sampled(self, first: int) -> tuple[SampledLanes, np.ndarray]:
         """What the compiled loop takes in the segment that begins with step `first`, and the rows behind the state."""
-        plant, numbers, delays = self.segments[first]
-        same = bool(np.all(delays == delays[0]))
-        own = np.vstack([(delays == 0).astype(np.float64), numbers])
-        return SampledLanes(plant, int(delays.max()), () if same else np.ascontiguousarray(delays)), own
+        return _in_rows(self.segments[first])
+
+
+def _in_rows(segment: Segment) -> tuple[SampledLanes, np.ndarray]:
+    plant, numbers, delays = segment
+    same = bool(np.all(delays == delays[0]))
+    own = np.vstack([(delays == 0).astype(np.float64), numbers])
+    return SampledLanes(plant, int(delays.max()), () if same else np.ascontiguousarray(delays)), own
+
+
+def sampled_plants(plant: Plant, sample_period_ns: int) -> tuple[Any, np.ndarray]:
+    """What compiled code takes as the plant of all lanes or of each, and what lies in the lanes' own rows, flat.
+
+    Raises:
+        PlantError: the lanes' plants are of different kinds.
+    """
+    if not isinstance(plant, EachLane):
+        return plant.sampled(sample_period_ns), np.empty(0)
+    sampled, own = _in_rows(_segment(_of_one_kind(list(plant.plants)), sample_period_ns))
+    return sampled, own.ravel()
+
+
+def initial_lanes(plant: Plant, lanes: int) -> tuple[tuple[float, ...], np.ndarray, np.ndarray]:
+    """Of all lanes: a state like theirs, their states at time 0, (states, lanes), and efforts before, (lanes,).
+
+    Raises:
+        PlantError: there are plants for another number of lanes.
+    """
+    if not isinstance(plant, EachLane):
+        state = plant.initial_state
+        return state, np.repeat(np.array(state)[:, None], lanes, axis=1), np.full(lanes, plant.initial_effort)
+    if len(plant.plants) != lanes:
+        raise PlantError(f"lanes is {lanes}, but there are plants for {len(plant.plants)}: give one number per lane")
+    plants = _of_one_kind(list(plant.plants))
+    return plants[0].initial_state, _states(plants), np.array([one.initial_effort for one in plants])
+
+
+def _states(plants: Sequence[Plant]) -> np.ndarray:
+    """At time 0, (states, lanes)."""
+    states = [plant.initial_state for plant in plants]
+    if len(set(map(len, states))) > 1:
+        raise PlantError("the lanes' plants differ in their number of states: a sweep needs the same for all")
+    return np.array(states).T
 
 
 def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: tuple[float, float]) -> LanePlants:
@@ -133,9 +172,6 @@ def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: 
     begun = _of_one_kind(
         [plant_at_start(plant_at, signals.start, first, effort_limits, signals.identity) for plant_at in plants]
     )
-    states = [plant.initial_state for plant in begun]
-    if len(set(map(len, states))) > 1:
-        raise PlantError("the lanes' plants differ in their number of states: a sweep needs the same for all")
     segments = {}
     for segment in signals.segments:
         segments[segment.first] = _segment(
@@ -145,8 +181,8 @@ def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: 
     if any(np.any(one != delays[0]) for one in delays):
         raise PlantError("dead_time cannot change while the loop runs: begin a new episode with it")
     return LanePlants(
-        states[0],
-        np.array(states).T,
+        begun[0].initial_state,
+        _states(begun),
         np.array([plant.initial_effort for plant in begun]),
         np.array([first_measured(plant) for plant in begun]),
         segments,
@@ -225,6 +261,10 @@ def is_direct(plant: Any, rows: Any, own: Any) -> Any:
     """Whether the lane's plant has no dead time, so that it takes the effort of the same sample."""
 
 
+def dead_samples(plant: Any, lane: Any) -> Any:
+    """The dead time of a lane's plant, in whole samples."""
+
+
 def keep_due(plant: Any, rows: Any, at: Any, v_due: Any) -> Any:
     """Write the input that was due to rows[at], where the next step looks for the one before."""
 
@@ -254,6 +294,13 @@ def _is_direct(plant: Any, rows: Any, own: Any) -> Any:
     if has_own_delays(plant):
         return lambda plant, rows, own: rows[own] > 0.0
     return lambda plant, rows, own: plant.delay == 0
+
+
+@inlined_implementation_of(dead_samples)
+def _dead_samples(plant: Any, lane: Any) -> Any:
+    if has_own_delays(plant):
+        return lambda plant, lane: plant.delays[lane]
+    return lambda plant, lane: plant.delay
 
 
 @inlined_implementation_of(keep_due)

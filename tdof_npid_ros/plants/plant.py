@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, NoReturn, Protocol
 
 
 class PlantError(ValueError):
@@ -39,6 +40,61 @@ class Plant(Protocol):
     def sampled(self, sample_period_ns: int) -> Any:
         """A named tuple of `plants.kernels`, for steps of `sample_period_ns`."""
         ...
+
+
+@dataclass(frozen=True)
+class EachLane:
+    """A plant of its own for each lane, all of one kind; what needs one plant refuses it in one line.
+
+    Attributes:
+        plants: in the order of the lanes.
+    """
+
+    plants: tuple[Plant, ...]
+
+    @property
+    def initial_state(self) -> tuple[float, ...]:
+        """Each lane has its own.
+
+        Raises:
+            PlantError: always.
+        """
+        self._refuse()
+
+    @property
+    def initial_output(self) -> float:
+        """As `initial_state`."""
+        self._refuse()
+
+    @property
+    def initial_effort(self) -> float:
+        """As `initial_state`."""
+        self._refuse()
+
+    def at_rest(self, output: float) -> EachLane:
+        """Each at rest with this output."""
+        return EachLane(tuple(plant.at_rest(output) for plant in self.plants))
+
+    def sampled(self, sample_period_ns: int) -> Any:
+        """As `initial_state`: `PlantSimulator` samples them together."""
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise PlantError(
+            f"each of {len(self.plants)} lanes has a plant of its own, but this takes one plant: give each of its "
+            "parameters one number"
+        )
+
+
+def one_plant(plant: Plant) -> Plant:
+    """The plant, if all lanes have the same.
+
+    Raises:
+        PlantError: each has its own.
+    """
+    if isinstance(plant, EachLane):
+        _ = plant.initial_state
+    return plant
 
 
 PlantAt = Callable[[dict[str, float]], Plant]  # the plant with some parameters changed

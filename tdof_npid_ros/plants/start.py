@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tdof_npid_ros.plants.noise import in_episode
-from tdof_npid_ros.plants.plant import Plant, PlantAt, PlantError
+from tdof_npid_ros.plants.plant import EachLane, Plant, PlantAt, PlantError
 
 
 def plant_at_start(
@@ -24,9 +24,16 @@ def plant_at_start(
     Raises:
         PlantError: nothing holds it there, or not within the effort's limits.
     """
+    plant = plant_at({} if start is None else parameters)
+    if isinstance(plant, EachLane):
+        return EachLane(tuple(_begun(one, start, effort_limits, episode) for one in plant.plants))
+    return _begun(plant, start, effort_limits, episode)
+
+
+def _begun(plant: Plant, start: float | None, effort_limits: tuple[float, float], episode: int) -> Plant:
     if start is None:
-        return in_episode(plant_at({}), episode)
-    plant = plant_at(parameters).at_rest(start)
+        return in_episode(plant, episode)
+    plant = plant.at_rest(start)
     low, high = effort_limits
     if not low <= plant.initial_effort <= high:
         raise PlantError(

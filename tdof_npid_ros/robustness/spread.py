@@ -60,12 +60,14 @@ def spreads_of(case: Case, texts: Sequence[str], sampling: Sampling = "uniform")
 
     Raises:
         RobustError: a text is none, names no parameter of the plant, or the plant cannot have a value in it.
+        PlantError: each lane of the case has a plant of its own.
 
     Example:
         >>> from tdof_npid_ros.case import load_case
         >>> spreads_of(load_case("p1-c0.5"), ["dead_time 30 %"])
         (Spread(name='dead_time', low=0.35, high=0.65, nominal=0.5),)
     """
+    _ = case.plant  # refuses a case in which each lane has its own
     spreads = tuple(_spread(case, text, sampling) for text in texts)
     names = [spread.name for spread in spreads]
     twice = next((name for name in names if names.count(name) > 1), None)

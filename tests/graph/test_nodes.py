@@ -93,6 +93,23 @@ def test_distributed_equals_local_with_lanes(graph: Any) -> None:
     assert terms["unlimited_effort/2"] == u[-1, 2]
 
 
+def test_distributed_equals_local_where_each_lane_has_a_plant_of_its_own(graph: Any) -> None:
+    own = {"gain": [1.0, 1.3, 0.7], "dead_time": [0.5, 0.0, 0.1234]}
+    kp = (9.4, 5.0, 2.0)
+    y, u = run_short(graph, "p1-c0.5", lanes=3, plant=own, kp=kp)
+    case = load_short("p1-c0.5")
+    case = dataclasses.replace(case, plant_values={**case.plant_values, **own})
+    local = case.simulate("short", case.gains.with_values(kp=kp))
+    assert np.array_equal(y, local.output)
+    assert np.array_equal(u, local.control_effort)
+    assert len(set(y[-1])) == 3
+    for refused, why in (
+        ({"gain": [1.0, 2.0]}, "gain has 2 values, but dead_time has 3"),
+        ({"lanes": 2}, "for 3 lanes, but lanes is 2"),
+    ):
+        assert why in graph.set_parameters("/plant", **refused)[0].reason
+
+
 def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> None:
     options = {"setpoint_rate": 2.0, "effort_rate": 50.0, "dead_band": 0.01, "filter_time": 0.02, "setpoint_max": 0.9}
     y, u = run_short(graph, "p1-c0.5", **options)

@@ -20,6 +20,7 @@ from tdof_npid_ros.graph.runtime.run import run_node
 from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.parameters import NOISE, PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import effort_limits, make_plant, model_table, named_model
+from tdof_npid_ros.plants.plant import EachLane, Plant
 
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 
@@ -36,6 +37,7 @@ class PlantNode(LoopEnd):
         period_ns = sample_period_in_ns(given["sample_period"])
         self.mode = given["mode"]
         self.joints = Joints(given["joint_names"])
+        self.own_plants: bool | None = None  # whether each lane has one
         self.checked({})
         self.accept_changes()
         self.port = PlantPort(self, self.model, self.model_names, period_ns, self.joints)
@@ -70,12 +72,23 @@ class PlantNode(LoopEnd):
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         p = {**self.values_of([*self.model_names, *NOISE, "lanes", "effort_min", "effort_max"]), **changes}
-        make_plant(self.model, p)
+        self._check_lanes(make_plant(self.model, p), p["lanes"])
         effort_limits(p)
         if self.joints.names and len(self.joints.names) != p["lanes"]:
             raise ValueError(
                 f"joint_names has {len(self.joints.names)} names, but lanes is {p['lanes']}: give one name per lane"
             )
+
+    def _check_lanes(self, plant: Plant, lanes: int) -> None:
+        """Refuse plants for other lanes, and another kind while it runs: it would be compiled in the midst of it."""
+        own = isinstance(plant, EachLane)
+        if isinstance(plant, EachLane) and len(plant.plants) != lanes:
+            raise ValueError(
+                f"there are parameters for {len(plant.plants)} lanes, but lanes is {lanes}: give one number per lane"
+            )
+        if self.own_plants not in (None, own):
+            raise ValueError("whether each lane has a plant of its own is decided at the start: start with lists")
+        self.own_plants = own
 
     def changed(self, changes: dict[str, Any]) -> None:
         """Take over accepted changes."""
@@ -85,9 +98,10 @@ class PlantNode(LoopEnd):
         """The model, the way of running, and what it waits for."""
         lanes = self.port.simulator.lanes
         waits = "scenario_plan" if self.mode == "lockstep" else "control_effort"
+        own = ", each with its own plant" if self.own_plants else ""
         return (
-            f"{self.model}, {lanes} lane{'s' if lanes > 1 else ''}, {self.mode} at {1e9 / self.port.period_ns:g} Hz, "
-            f"waiting for {self.resolve_topic_name(waits)}"
+            f"{self.model}, {lanes} lane{'s' if lanes > 1 else ''}{own}, {self.mode} at "
+            f"{1e9 / self.port.period_ns:g} Hz, waiting for {self.resolve_topic_name(waits)}"
         )
 
     def state(self) -> tuple[int, str, dict[str, object]]:

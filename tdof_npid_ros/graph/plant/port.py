@@ -132,7 +132,7 @@ class PlantPort:
             PlantError: there is no such parameter, or it cannot change while the loop runs, or its value is wrong.
         """
         values = self.node.values_of([*self._model_names, *NOISE])
-        changeable = changeable_parameters(self._model, values)
+        changeable = changeable_parameters(self._model)
         for name in changes:
             if name not in changeable:
                 raise PlantError(
