@@ -172,6 +172,7 @@ def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: 
     begun = _of_one_kind(
         [plant_at_start(plant_at, signals.start, first, effort_limits, signals.identity) for plant_at in plants]
     )
+    states = _states(begun)
     segments = {}
     for segment in signals.segments:
         segments[segment.first] = _segment(
@@ -182,7 +183,7 @@ def lane_plants(plants: Sequence[PlantAt], signals: SampledPlan, effort_limits: 
         raise PlantError("dead_time cannot change while the loop runs: begin a new episode with it")
     return LanePlants(
         begun[0].initial_state,
-        _states(begun),
+        states,
         np.array([plant.initial_effort for plant in begun]),
         np.array([first_measured(plant) for plant in begun]),
         segments,
