@@ -52,10 +52,9 @@ class LoopAtWork:
             raise ExperimentError("the controller knows no experiments: it is of an older version")
         if self.values["experiment"]:
             raise ExperimentError(f"experiment {self.values['experiment']} has the loop: wait for its end")
-        if self.gains.lanes > 1:
-            raise ExperimentError(
-                f"the loop has {self.gains.lanes} lanes: an experiment is of one; give that one a controller"
-            )
+        lanes = max(self.gains.lanes, len(self.values["joint_names"]))  # one gain may serve all joints
+        if lanes > 1:
+            raise ExperimentError(f"the loop has {lanes} lanes: an experiment is of one; give that one a controller")
         self.plant = self._plant_limits()
 
     @property

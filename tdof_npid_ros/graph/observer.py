@@ -184,13 +184,10 @@ class LoopObserver:
         elif len(self.lane_names) != len(answer.effort):
             self.lane_names = tuple(map(str, range(len(answer.effort))))
         self._latest_answer = time.monotonic()
-        y, applied = output.position, output.effort
-        if len(y) != len(answer.effort):
-            joints = Joints(answer.name)
-            try:
-                y, applied = joints.selected(output.name, y), joints.selected(output.name, applied)
-            except ValueError:
-                return  # another robot's
+        try:
+            y, applied = lanes_of(output, answer)
+        except ValueError:
+            return  # another robot's
         self.rows.append(
             Row(self._last, self._labels[self._label], answer.position, y, answer.effort, applied, answer.stamp_ns)
         )
@@ -241,6 +238,21 @@ class LoopObserver:
     def flush(self, topic: str) -> None:
         """Wait until what was published has been received."""
         self._publishers[topic].wait_for_all_acked(Duration(seconds=2.0))
+
+
+def lanes_of(output: Sample, answer: Sample) -> tuple[np.ndarray, np.ndarray]:
+    """Position and effort of an output, (lanes,), in the order of the lanes of its answer.
+
+    Raises:
+        ValueError: there are not those lanes in it.
+    """
+    y, applied = output.position, output.effort
+    if output.name == answer.name:
+        return y, applied
+    if len(y) == len(answer.effort) and not set(answer.name) <= set(output.name):
+        return y, applied  # the lanes bear other names here and there
+    joints = Joints(answer.name)
+    return joints.selected(output.name, y), joints.selected(output.name, applied)
 
 
 def _latest(kept: deque[T], number: int) -> list[T]:

@@ -143,3 +143,64 @@ def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path, moment: st
     assert (tool.returncode, errors) == (130, "tdof-npid commission: interrupted\n")
     found = graph.get_parameters("/loop/controller", "experiment", "kp", "ki", "manual", "setpoint")
     assert found == ["", *loop.gains, loop.by_hand, loop.start]
+
+
+PLAIN = {"kp": 0.3, "ki": 2.0, "sigma": 1.0}
+ROBOT = Path(__file__).with_name("plain_robot.py").read_text()
+
+
+def driven_robot(graph: Any) -> Any:
+    """Somebody's node, driven by our controller with gains that hold it."""
+    robot = graph.start("robot", program=ROBOT, namespace="/loop")
+    graph.start("controller", namespace="/loop", type="tdof_npid2", setpoint=1.0, sample_period=0.01, **PLAIN)
+    graph.wait_for_nodes("/loop/controller")
+    return robot
+
+
+def commission(graph: Any, folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    """The tool as a process; what it says is in `tool.log`."""
+    with (folder / "tool.log").open("w") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag", *arguments],
+            env=graph.environment, cwd=folder, stdout=log, stderr=log, text=True,
+        )  # fmt: skip
+
+
+def test_somebodys_node_is_commissioned(graph: Any, tmp_path: Path) -> None:
+    driven_robot(graph)
+    tool = commission(graph, tmp_path, "--json")
+    graph.wait_until(lambda: tool.poll() is not None, 110.0, "the tool's end")
+    told = (tmp_path / "tool.log").read_text()
+    assert tool.returncode == 0, told[-1000:]
+    report = json.loads(told)
+    assert report["outcome"] == "kept" and report["experiments"] <= 3
+    found = {name: one["value"] for name, one in report["model"]["parameters"].items()}
+    assert report["model"]["structure"] == "first_order"
+    assert found["gain"] == pytest.approx(2.0, rel=0.03) and found["time_constant"] == pytest.approx(0.2, rel=0.1)
+    assert graph.get_parameters("/loop/controller", *PLAIN) == [report["gains"][name] for name in PLAIN]
+
+
+def test_a_step_worse_than_predicted_brings_back_the_gains_of_before(graph: Any, tmp_path: Path) -> None:
+    robot = driven_robot(graph)
+    tool, log = commission(graph, tmp_path), tmp_path / "tool.log"
+    now = lambda: graph.get_parameters("/loop/controller", *PLAIN)  # noqa: E731
+    graph.wait_until(lambda: now() != list(PLAIN.values()), 110.0, "the trial")
+    robot.send(signal.SIGUSR1)
+    graph.wait_until(lambda: "the gains are those of before" in log.read_text(), 60.0, "that it is worse")
+    assert now() == list(PLAIN.values())
+    tool.send_signal(signal.SIGINT)
+    graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
+    assert tool.returncode == 130
+    assert "not yet: measured and predicted differ by" in log.read_text()
+    assert graph.get_parameters("/loop/controller", "experiment", *PLAIN) == ["", *PLAIN.values()]
+
+
+@pytest.mark.parametrize("gains", [{"kp": [2.0, 2.0]}, {"kp": 2.0, "joint_names": ["a", "b"]}], ids=str)
+def test_several_lanes_are_refused_with_what_to_do(graph: Any, tmp_path: Path, gains: dict[str, Any]) -> None:
+    graph.start("controller", namespace="/loop", **gains)
+    graph.wait_for_nodes("/loop/controller")
+    tool = commission(graph, tmp_path)
+    graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
+    told = "the loop has 2 lanes: an experiment is of one; give that one a controller"
+    assert (tool.returncode, (tmp_path / "tool.log").read_text()) == (2, f"tdof-npid commission: {told}\n")
+    assert graph.get_parameters("/loop/controller", "experiment", *gains) == ["", *gains.values()]
