@@ -8,7 +8,7 @@ controller node.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,7 +64,7 @@ def verify(path: str | Path, chosen: Chosen = NOTHING_CHOSEN, law_only: bool = F
             replay.run()
             if not law_only:
                 check_outputs(loop, account)
-                check_messages(reader, loop, replay.terms, account)
+                check_messages(reader, loop, replay.terms, replay.unverified, account)
     return account
 
 
@@ -87,6 +87,8 @@ class _Replay:
         assert loop.control_effort is not None
         self._law_only = law_only
         self.terms: dict[int, list[np.ndarray]] = defaultdict(list)  # of the verified answers, by stamp
+        self.unverified: Counter[int] = Counter()  # the other answers, by stamp
+        self._noted: Place | None = None  # whose terms were noted last
         self._loop = loop
         self._answers = loop.control_effort
         self._account = account
@@ -123,6 +125,7 @@ class _Replay:
         if reason is not None:
             self._known = False
             self._account.unverifiable[reason] += 1
+            self.unverified[answer.stamp_ns] += 1
             self._passed_over = place
             if self._session is not None:
                 self._session.pass_over(place)
@@ -131,9 +134,10 @@ class _Replay:
         expected = self._answer_again(self._session_with(configuration), answer, place, y, r)
         if not self._known:
             self._account.unverifiable[UNKNOWN_STATE] += 1
+            self.unverified[answer.stamp_ns] += 1
             return
         assert self._session is not None
-        self.terms[answer.stamp_ns].append(self._session.controller.terms.copy())
+        self._note_terms(place, self._session.controller.terms)
         planned = None if self._law_only else self._planned(answer, len(r))
         if expected.tobytes() != u.tobytes():
             self._differs("control effort", answer, y, r, u, expected)
@@ -145,6 +149,13 @@ class _Replay:
             self._account.unverifiable[wrong] += 1
         else:
             self._account.equal += 1
+
+    def _note_terms(self, place: Place, terms: np.ndarray) -> None:
+        """Of an answer that is given again, the controller publishes the terms once."""
+        noted = self.terms[place.stamp_ns]
+        if place != self._noted or terms.tobytes() != noted[-1].tobytes():
+            noted.append(terms.copy())
+        self._noted = place
 
     def _wrong_names(self, answer: _Answer, lanes: int) -> str:
         """Why an answer to our plant bears other names than its controller gives; empty if it does not."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,8 +28,14 @@ UNKNOWN_PARAMETER = "parameters that no such node has, out of their range, or no
 Terms = Mapping[int, Sequence[np.ndarray]]  # of verified answers, (6, lanes), by stamp, in order
 
 
-def check_messages(reader: BagReader, loop: Loop, terms: Terms, account: Verification) -> None:
-    """Check plans, their signals, the law's terms and parameters; what cannot be decoded is not checked."""
+def check_messages(
+    reader: BagReader, loop: Loop, terms: Terms, unverified: Mapping[int, int], account: Verification
+) -> None:
+    """Check plans, their signals, the law's terms and parameters; what cannot be decoded is not checked.
+
+    Args:
+        unverified: how many other answers there are, by stamp.
+    """
     labels = {EpisodeLabel.parse(str(frame)) for frame in np.unique(loop.output.frame_id.astype(str))}
     planned = {label.plan for label in labels if label is not None and label.plan}
     _check_plans(reader, loop, planned, account)
@@ -37,7 +43,7 @@ def check_messages(reader: BagReader, loop: Loop, terms: Terms, account: Verific
         for name, field in (("setpoint", "position"), ("disturbance", "effort")):
             _check_signal(reader, loop, name, field, account)
     old = any(label is not None and not label.activation for label in labels)
-    _check_terms(reader, loop, terms, old, account)
+    _check_terms(reader, loop, terms, unverified, old, account)
     if planned:
         _check_parameters(reader, loop, account)
     names = ("output", "control_effort", "setpoint", "disturbance", "controller_state", "scenario_plan")
@@ -111,29 +117,35 @@ def _bytes(values: set[float]) -> set[bytes]:
     return {np.float64(value).tobytes() for value in values}
 
 
-def _check_terms(reader: BagReader, loop: Loop, terms: Terms, old: bool, account: Verification) -> None:
-    """`controller_state` holds the terms that the answers were made of."""
+def _check_terms(
+    reader: BagReader, loop: Loop, terms: Terms, unverified: Mapping[int, int], old: bool, account: Verification
+) -> None:
+    """`controller_state` holds the terms that the answers were made of. It bears their stamp alone: those of several
+    episodes are told apart by their values."""
     topic = f"{loop.namespace}controller_state"
     if topic not in reader.topics or topic in reader.unreadable or reader.topics[topic].type != JOINT_STATE:
         return
     signal = signal_of(reader, topic)
-    waiting = {stamp: deque(found) for stamp, found in terms.items()}
-    for step in range(len(signal)):
-        stamp_ns = int(signal.stamp_ns[step])
+    stamps = signal.stamp_ns.tolist()
+    others = {  # what cannot be compared, for its answer was not verified or is not in the bag
+        stamp: max(count - len(terms.get(stamp, ())), unverified.get(stamp, 0))
+        for stamp, count in Counter(stamps).items()
+    }
+    waiting = {stamp: list(found) for stamp, found in terms.items()}
+    for step, stamp in enumerate(stamps):
         found = np.asarray(signal.position[step], np.float64)
-        candidates = waiting.get(stamp_ns)
-        if not candidates:
-            account.unchecked[NO_ANSWER] += 1
-            continue
-        expected = candidates[0]
-        while candidates and not _same_terms(found, candidates[0], old):
-            candidates.popleft()
-        if candidates and _names_of_terms(signal, step):
-            candidates.popleft()
+        candidates = waiting.get(stamp, [])
+        at = next((i for i, expected in enumerate(candidates) if _same_terms(found, expected, old)), None)
+        if at is not None and _names_of_terms(signal, step):
+            del candidates[: at + 1]
             account.note(STATE)
-            continue
-        told = tuple(found.tolist()), tuple(expected.ravel().tolist())
-        account.note(STATE, Difference("term", topic, step, stamp_ns, "", {}, *told))
+        elif at is None and others[stamp] > 0:
+            others[stamp] -= 1
+            account.unchecked[NO_ANSWER] += 1
+        else:
+            expected = tuple(candidates[at or 0].ravel().tolist()) if candidates else ()
+            told = tuple(found.tolist()), expected or ("nothing at this time",)
+            account.note(STATE, Difference("term", topic, step, stamp, "", {}, *told))
 
 
 def _same_terms(found: np.ndarray, expected: np.ndarray, old: bool) -> bool:

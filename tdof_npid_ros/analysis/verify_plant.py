@@ -25,6 +25,7 @@ NO_PLANT = "outputs: the plant's parameters are not in the bag"
 NO_PLAN = "outputs: their plan is not in the bag"
 NO_EFFORT = "outputs: the efforts before them are not in the bag"
 GOING_OVER = "applied efforts: between the fallback and an effort, while the plant went over to it"
+BEFORE_THE_BAG = "applied efforts: of answers from before the recording"
 NOT_ALL_EFFORTS = "applied efforts: none that is recorded, but the bag lacks some"
 NO_APPLIED = "outputs: they do not tell the effort applied"
 CHANGES_COUNT_NS = 1_000_000_000  # a change of the plant's parameters may be in force this long before or after it
@@ -157,6 +158,7 @@ class _Outputs:
         recorded = [(int(answers.stamp_ns[step]), np.asarray(answers.effort[step], dtype=np.float64)) for step in mine]
         allowed: dict[int, dict[bytes, float]] = {}
         is_start = True  # until the first effort
+        is_joined = run.first == 0 and int(output.sequence[0]) != 1  # and until the first effort that is in the bag
         for i in range(run.first, run.stop):
             applied = np.asarray(output.effort[i], dtype=np.float64)
             if not applied.size:
@@ -169,8 +171,12 @@ class _Outputs:
                     allowed[id(values)] = _allowed(values, recorded, applied.size)
             stamp_ns, told = int(output.stamp_ns[i]), applied.tobytes()
             is_start = is_start and any(told in _at_start(values, applied.size) for values in possible)
-            if is_start or any(allowed[id(values)].get(told, math.inf) < stamp_ns for values in possible):
+            since = [allowed[id(values)].get(told, math.inf) for values in possible]
+            if is_start or any(one < stamp_ns for one in since):
                 self._account.note(APPLIED)
+                is_joined = is_joined and not any(-math.inf < one < stamp_ns for one in since)
+            elif is_joined:
+                self._account.unchecked[BEFORE_THE_BAG] += 1
             elif self._lacks_some:
                 self._account.unchecked[NOT_ALL_EFFORTS] += 1
             elif any(_is_between(applied, values, recorded) for values in possible):

@@ -29,9 +29,10 @@ def joint_state(
     position: Sequence[float] = (),
     effort: Sequence[float] = (),
     velocity: Sequence[float] = (),
+    names: Sequence[str] = (),
 ) -> bytes:
     arrays = [np.array(values, np.float64) for values in (position, velocity, effort)]
-    return _cdr(JOINT_STATE, TYPES.types[JOINT_STATE](_header(stamp_ns, frame_id), [], *arrays))
+    return _cdr(JOINT_STATE, TYPES.types[JOINT_STATE](_header(stamp_ns, frame_id), list(names), *arrays))
 
 
 def plan_message(plan: Any) -> bytes:

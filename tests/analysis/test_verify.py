@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loop_bags import JOINT_STATE, LoopBag, joint_state
+from loop_bags import JOINT_STATE, START_NS, TRAJECTORY, LoopBag, joint_state, plan_message
 
 from tdof_npid_ros.analysis import AnalysisError, verify
 from tdof_npid_ros.analysis.verify import NO_PARAMETERS, UNKNOWN_STATE
+from tdof_npid_ros.analysis.verify_messages import NO_ANSWER, STATE
+from tdof_npid_ros.analysis.verify_plant import APPLIED, BEFORE_THE_BAG
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.controller import Controller, parameters_digest
+from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import PLAIN
 
 
@@ -226,19 +229,23 @@ def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_pa
     assert verify.verify(tmp_path / "bag").equal == 300
 
 
-def realtime_bag(folder, case, step, applied, limit=2.0) -> None:
-    """Thirty outputs of a plant in realtime, that of `step` with another applied effort."""
+def realtime_bag(folder, case, step, applied, limit=2.0, first=0) -> None:
+    """Thirty outputs of a plant in realtime, from the first one recorded on, that of `step` with another applied
+    effort."""
     limited = replace(case, effort_limits=(-limit, limit))
     with LoopBag(folder) as bag:
         bag.configuration(limited, case.gains, mode="realtime", fallback="effort", fallback_effort=0.25)
         controller = Controller(case.gains, case.sample_period_ns)
         before = 0.0
         for k in range(30):
-            stamp, y = k * case.sample_period_ns, np.array([0.5 * np.sin(k / 10)])
+            stamp, y = START_NS + k * case.sample_period_ns, np.array([0.5 * np.sin(k / 10)])
             told = applied(before) if k == step else before
-            bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
             controller.answer(stamp, np.ones(1), y)
             before = float(np.clip(controller.effort[0], -limit, limit))
+            if k < first:
+                bag.skip("output"), bag.skip("control_effort")
+                continue
+            bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
             answer = joint_state(stamp, f"{controller.digest} -/0011aabb.1", [1.0], controller.effort)
             bag.write("control_effort", JOINT_STATE, answer)
 
@@ -273,6 +280,54 @@ def test_an_effort_is_not_applied_before_the_output_that_it_answers(tmp_path, ca
     assert verify.verify(tmp_path / "bag").status == 0
     realtime_bag(tmp_path / "early", case, 20, lambda it: first[0], 1e3)
     assert verify.verify(tmp_path / "early").status == 1
+
+
+def test_an_effort_of_before_the_recording_is_not_checked_and_not_different(tmp_path, case) -> None:
+    realtime_bag(tmp_path / "bag", case, 20, lambda it: it, 1e3, first=10)
+    account = verify.verify(tmp_path / "bag")
+    assert not account.differs and account.unchecked == {BEFORE_THE_BAG: 1}
+    assert account.checks[APPLIED].equal == 19
+    realtime_bag(tmp_path / "other", case, 20, lambda it: 1e6, 1e3, first=10)
+    assert verify.verify(tmp_path / "other").status == 1
+
+
+def terms_bag(folder, case, lost, wrong=()) -> None:
+    """An episode played twice, with the law's terms; of the second the answers `lost` are missing."""
+    names = list(TERMS)
+    plan, run = case.plans["setpoint"], case.simulate("setpoint")
+    with LoopBag(folder) as bag:
+        bag.configuration(case, case.gains)
+        bag.write("scenario_plan", TRAJECTORY, plan_message(plan))
+        for number, alpha in ((1, 0.0), (2, 0.5)):
+            gains = case.gains.with_values(alpha=alpha)
+            bag.parameters("controller", {"alpha": alpha})
+            run, label = case.simulate("setpoint", gains), f"{plan.digest}/0011aabb.{number}"
+            controller = Controller(gains, case.sample_period_ns)
+            for k, y in enumerate(run.output):
+                stamp, r = k * case.sample_period_ns, run.setpoint[k : k + 1]
+                controller.answer(stamp, r, y)
+                applied = run.control_effort[k - 1] if k else [0.0]
+                bag.write("output", JOINT_STATE, joint_state(stamp, label, y, applied))
+                if number == 1 or k not in lost:
+                    answer = joint_state(stamp, f"{controller.digest} {label}", r, controller.effort)
+                    bag.write("control_effort", JOINT_STATE, answer)
+                else:
+                    bag.skip("control_effort")
+                terms = controller.terms.ravel() + ((number, k) in wrong)
+                bag.write("controller_state", JOINT_STATE, joint_state(stamp, "", terms, names=names))
+
+
+def test_the_terms_of_an_answer_that_is_not_in_the_bag_are_not_those_of_another_episode(tmp_path, case) -> None:
+    terms_bag(tmp_path / "whole", case, ())
+    assert verify.verify(tmp_path / "whole").status == 0
+    terms_bag(tmp_path / "bag", case, range(300, 310))
+    account = verify.verify(tmp_path / "bag")
+    assert not account.differs and account.unchecked[NO_ANSWER] == 101  # all from the first one lost on
+    assert account.checks[STATE].equal == 701
+    for at in ((1, 100), (2, 100)):  # both answers there, one with other terms
+        terms_bag(tmp_path / f"{at}", case, (), {at})
+        account = verify.verify(tmp_path / f"{at}")
+        assert account.checks[STATE].different == 1 and not account.unchecked
 
 
 def test_the_law_alone(tmp_path, case, capsys) -> None:

@@ -57,13 +57,19 @@ class Recorded:
     def harm(self, node: str, number: int, seconds: float) -> None:
         """Kill a node and start it again, or stop it for a time."""
         process = self.processes[node]
+        if node == "recorder":  # of what it has recorded, the last second may be lost
+            self._graph.wait_for_log(process, "ready", 60.0)
+            self._spend(2.0)
         process.send(number)
         if number == signal.SIGKILL:
             self.processes[node] = self.start(node)
         else:
-            until = time.monotonic() + seconds
-            self._graph.wait_until(lambda: time.monotonic() > until, seconds + 5.0)
+            self._spend(seconds)
             process.send(signal.SIGCONT)
+
+    def _spend(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        self._graph.wait_until(lambda: time.monotonic() > until, seconds + 5.0)
 
 
 def columns(bag: Path, topic: str) -> dict[str, np.ndarray]:
@@ -106,7 +112,7 @@ def test_in_lockstep_every_bit_is_as_in_process(graph: Any, tmp_path: Path) -> N
     joins = equal = 0
     for bag in loop.bags:
         account = verify(bag)
-        assert account.sound, account
+        assert not account.differs, account.lines()
         outputs, efforts = columns(bag, "/output"), columns(bag, "/control_effort")
         labels = np.array([str(label).split()[-1] for label in efforts["header.frame_id"]])
         for label in np.unique(outputs["header.frame_id"]):
@@ -164,7 +170,7 @@ def test_in_realtime_the_output_comes_back(graph: Any, tmp_path: Path) -> None:
     equal = 0
     for bag in loop.bags:
         account = verify(bag)
-        assert account.sound, account
+        assert not account.differs, account.lines()
         equal += account.equal
     assert equal > 30 * ROUNDS
     print(f"{ROUNDS} rounds, {len(loop.bags)} bags, {equal} efforts verified")
