@@ -95,6 +95,15 @@ def test_whatever_stops_an_experiment_all_is_as_before_and_verified(graph: Any, 
     moves = {"experiment_setpoint": 1.5}
     by_hand = {"experiment_effort": 1.5}
     stopped("range", lambda: setattr(robot, "says", 2.5), "output 2.5 is beyond safe_range.output", **by_hand)
+    stopped(
+        "effort",
+        lambda: graph.set_parameters(
+            "/robot/controller", atomically=True, experiment="effort", experiment_setpoint=1.9
+        ),
+        "is beyond safe_range.effort",
+        experiment_setpoint=1.0,
+        **{"safe_range.effort": [-5.0, 2.0]},
+    )
     stopped("nan", lambda: setattr(robot, "says", math.nan), "not finite", **moves)
     stopped("silence", lambda: setattr(robot, "silent", True), "no output comes", **by_hand)
     stopped(
