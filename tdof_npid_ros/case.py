@@ -31,6 +31,7 @@ from tdof_npid_ros.plants.noise import largest_noise, noiseless
 from tdof_npid_ros.plants.ode import class_by_value, take_class
 from tdof_npid_ros.plants.per_lane import LanePlants, lane_plants
 from tdof_npid_ros.plants.plant import Plant, one_plant
+from tdof_npid_ros.plotting import Units
 from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
 
@@ -98,6 +99,11 @@ class Case:
         """The case with each lane's plant alone, where each lane has its own; else the case."""
         values = values_of_lanes(self.model, self.plant_values)
         return [self] if values is None else [replace(self, plant_values=one) for one in values]
+
+    @property
+    def units(self) -> Units:
+        """Of output and effort, as far as the plant's parameters tell."""
+        return Units.of(self.plant_values)
 
     @property
     def noise_bound(self) -> float:

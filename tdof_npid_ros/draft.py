@@ -152,7 +152,7 @@ class Draft:
         at: the output where the episodes begin, at rest.
         rest_effort: the effort that holds it there.
         effort: limits of the effort, either may be infinite.
-        unit: of the output, for the comments.
+        unit, effort_unit: of output and effort, for axes, tables and comments; empty: not told.
         sample_period: s; None: chosen.
         disturbance: of the second episode, in the effort's unit; None: chosen.
         controller: the type.
@@ -167,6 +167,7 @@ class Draft:
     rest_effort: float = 0.0
     effort: tuple[float, float] = (-math.inf, math.inf)
     unit: str = ""
+    effort_unit: str = ""
     sample_period: float | None = None
     disturbance: float | None = None
     controller: ControllerType = "tdof_npid2"
@@ -247,7 +248,9 @@ class Draft:
         low, high = self.effort
         start, level = f"0 start {self.at:.6g}", f"{self.at + self.step:.6g}"
         kp, ki, kd = (significant(value) for value in (gains.kp, gains.ki, gains.kd))
-        where = self.unit or "the output's unit"
+        where, its_effort = self.unit or "the output's unit", self.effort_unit or "the effort's unit"
+        units = {"output_unit": self.unit, "effort_unit": self.effort_unit}
+        plant = {**self.plant, **{name: unit for name, unit in units.items() if unit}}
         used = {"kp": kp, "ki": ki, "kd": kd}
         lines = [
             f"# {self.title}",
@@ -263,7 +266,7 @@ class Draft:
                 f"    effort_max: {_yaml(high)}",
             ]
         lines += ["/**/plant:", "  ros__parameters:"]
-        lines += [f"    {name}: {_yaml(value)}" for name, value in self.plant.items()]
+        lines += [f"    {name}: {_yaml(value)}" for name, value in plant.items()]
         lines += [
             "/**/controller:",
             "  ros__parameters:",
@@ -280,7 +283,7 @@ class Draft:
             "    episodes: [setpoint, disturbance]  # what simulate, tune and run play, and what is measured",
             "    plan:",
             f'      setpoint: ["{start}", "0 setpoint {level}", "{end}"]  # in {where}',
-            f'      disturbance: ["0 start {level}", "0 disturbance {self.load:g}", "{end}"]  # in the effort\'s unit',
+            f'      disturbance: ["0 start {level}", "0 disturbance {self.load:g}", "{end}"]  # in {its_effort}',
             "/**/tuner:",
             "  ros__parameters:",
             "    weight: 1.0  # of the disturbance episode's error, beside the setpoint episode's",

@@ -235,20 +235,21 @@ def finish_legend(plot: Any) -> None:
         plot.add_layout(plot.legend[0], "above")
 
 
-def response_plots(panel: Panel, *, unit: str = "", effort_unit: str = "") -> list[Any]:
+def response_plots(panel: Panel) -> list[Any]:
     """The output and the effort of an episode, two plots that zoom together; limits drawn, saturation shaded."""
     from bokeh.models import BoxAnnotation, Range1d, Span, Title
 
     until = shown_until(panel)
-    output = new_plot("output" + (f" ({unit})" if unit else ""), 300, x_label="")
-    effort = new_plot("effort" + (f" ({effort_unit})" if effort_unit else ""), 240, x_range=output.x_range)
+    units = panel.units
+    output = new_plot(units.titled("output", "{output}"), 300, x_label="")
+    effort = new_plot(units.titled("effort", "{effort}"), 240, x_range=output.x_range)
     output.x_range.start, output.x_range.end = panel.begin, until
     drawn: set[bytes] = set()
     look: dict[str, Any]
     for number, curve in enumerate(panel.curves):
         given = (
-            (output, curve.setpoint, "setpoint", "dashed", unit),
-            (effort, curve.disturbance, "disturbance", "dotted", effort_unit),
+            (output, curve.setpoint, "setpoint", "dashed", units.output),
+            (effort, curve.disturbance, "disturbance", "dotted", units.effort),
         )
         for plot, values, name, dash, its_unit in given:
             if values is None or (key := name.encode() + values.tobytes()) in drawn or not _is_drawn(values, name):
@@ -258,9 +259,9 @@ def response_plots(panel: Panel, *, unit: str = "", effort_unit: str = "") -> li
             draw(plot, source_of(curve.time, values, name, steps=True), name, **look)
         name = curve.label
         look = {"color": PALETTE[number % len(PALETTE)], "dash": DASHES[number % len(DASHES)]}
-        above = draw(output, source_of(curve.time, curve.output, name), name, unit=unit, width=2.2, **look)
+        above = draw(output, source_of(curve.time, curve.output, name), name, unit=units.output, width=2.2, **look)
         its_effort = source_of(curve.time, curve.effort, name, steps=True)
-        below = draw(effort, its_effort, name, unit=effort_unit, width=1.8, **look)
+        below = draw(effort, its_effort, name, unit=units.effort, width=1.8, **look)
         above.js_link("visible", below, "visible")
         for first, last in _at_limit(panel, curve.time, curve.effort):
             shade = {"fill_color": GUIDE, "fill_alpha": 0.15, "line_color": None}

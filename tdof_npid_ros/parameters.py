@@ -390,6 +390,8 @@ PLANT: Final = table(
     Parameter("effort_min", -math.inf, "lower limit of the actuator", "the effort's unit", of_loop=True),
     Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit", of_loop=True),
     *NOISE.values(),
+    Parameter("output_unit", "", "unit of the output, for axes and tables", fixed=True),
+    Parameter("effort_unit", "", "unit of the effort, likewise", fixed=True),
     Parameter(
         "start",
         math.inf,

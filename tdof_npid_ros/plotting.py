@@ -5,10 +5,10 @@ Matplotlib is imported where something is drawn, so that whoever draws nothing d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,35 @@ class PlottingError(ValueError):
     """A picture that cannot be written; the message names the file and why."""
 
 
+class Units(NamedTuple):
+    """Units of a loop's signals, for axes and tables; empty: not known.
+
+    Example:
+        >>> Units("K", "%").titled("IAE", "{output} s"), Units().titled("IAE", "{output} s")
+        ('IAE (K s)', 'IAE')
+    """
+
+    output: str = ""
+    effort: str = ""
+
+    @classmethod
+    def of(cls, plant: Mapping[str, object]) -> Units:
+        """What a plant's parameters tell."""
+        return cls(str(plant.get("output_unit", "")), str(plant.get("effort_unit", "")))
+
+    def titled(self, name: str, unit: str) -> str:
+        """A name with its unit, a format of `output` and `effort`; the name alone where a part of it is not known."""
+        known = self._asdict()
+        whole = unit and all(known[part] for part in known if f"{{{part}}}" in unit)
+        return f"{name} ({unit.format(**known)})" if whole else name
+
+
+def common_units(of: Iterable[Units]) -> Units:
+    """The units of several things, where all have the same."""
+    found = set(of)
+    return found.pop() if len(found) == 1 else Units()
+
+
 @dataclass(frozen=True)
 class Curve:
     """One run in a picture.
@@ -72,12 +101,14 @@ class Panel:
         curves: the runs.
         limits: of the effort, drawn where they are finite and near.
         notes: lines beside the title: numbers of the response.
+        units: of its axes.
     """
 
     title: str
     curves: Sequence[Curve]
     limits: tuple[float, float] = (-np.inf, np.inf)
     notes: Sequence[str] = field(default=())
+    units: Units = field(default_factory=Units)
 
     @property
     def begin(self) -> float:
@@ -173,14 +204,11 @@ def save(figure: Figure, path: Path) -> None:
         raise PlottingError(f"{path} cannot be written: {error}") from None
 
 
-def draw_responses(
-    panels: Sequence[Panel], path: Path, *, unit: str = "", effort_unit: str = "", title: str = ""
-) -> None:
+def draw_responses(panels: Sequence[Panel], path: Path, *, title: str = "") -> None:
     """Write the picture of some episodes: outputs above, efforts below, one legend for all.
 
     Args:
         panels: one for each column; curves of one number have one colour in all of them.
-        unit, effort_unit: for the axes; empty: not known.
 
     Raises:
         PlottingError: the file cannot be written.
@@ -197,8 +225,9 @@ def draw_responses(
         below.set_xlabel("time (s)")
         for axis in (above, below):
             axis.set_xlim(panel.begin, until)
-    axes[0][0].set_ylabel("output y" + (f" ({unit})" if unit else ""))
-    axes[1][0].set_ylabel("effort u" + (f" ({effort_unit})" if effort_unit else ""))
+    units = common_units(panel.units for panel in panels)
+    axes[0][0].set_ylabel(units.titled("output y", "{output}"))
+    axes[1][0].set_ylabel(units.titled("effort u", "{effort}"))
     handles: dict[str, Any] = {}
     for axis in (one for row in axes for one in row):
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):

@@ -13,17 +13,17 @@ from tdof_npid_ros.metrics import effort_use, in_units
 from tdof_npid_ros.plotting import Curve, Panel
 from tdof_npid_ros.stability.margins import Margins, margins
 
-METRICS = {
-    ("setpoint", "overshoot_percent"): "setpoint: overshoot (%)",
-    ("setpoint", "settling_time_s"): "setpoint: settling time (s)",
-    ("setpoint", "iae"): "setpoint: IAE",
-    ("setpoint", "effort_peak"): "setpoint: largest |u|",
-    ("setpoint", "saturated_percent"): "setpoint: at limit (%)",
-    ("disturbance", "peak"): "disturbance: peak",
-    ("disturbance", "recovery_time_s"): "disturbance: recovery time (s)",
-    ("disturbance", "iae"): "disturbance: IAE",
-    ("disturbance", "effort_peak"): "disturbance: largest |u|",
-    ("disturbance", "saturated_percent"): "disturbance: at limit (%)",
+METRICS = {  # titles and units
+    ("setpoint", "overshoot_percent"): ("setpoint: overshoot", "%"),
+    ("setpoint", "settling_time_s"): ("setpoint: settling time", "s"),
+    ("setpoint", "iae"): ("setpoint: IAE", "{output} s"),
+    ("setpoint", "effort_peak"): ("setpoint: largest |u|", "{effort}"),
+    ("setpoint", "saturated_percent"): ("setpoint: at limit", "%"),
+    ("disturbance", "peak"): ("disturbance: peak", "{output}"),
+    ("disturbance", "recovery_time_s"): ("disturbance: recovery time", "s"),
+    ("disturbance", "iae"): ("disturbance: IAE", "{output} s"),
+    ("disturbance", "effort_peak"): ("disturbance: largest |u|", "{effort}"),
+    ("disturbance", "saturated_percent"): ("disturbance: at limit", "%"),
 }
 Runs = dict[str, dict[str, Trajectory]]
 """By episode, by what the gains are called."""
@@ -46,6 +46,7 @@ def panels(case: Case, runs: Runs) -> list[Panel]:
             name,
             [curve_of(label, run) for label, run in under.items()],
             limits,
+            units=case.units,
         )
         for name, under in runs.items()
     ]
@@ -93,7 +94,10 @@ def numbers(case: Case, of: Mapping[str, Gains]) -> list[list[str]]:
     """
     found = {label: measured(case, gains) for label, gains in of.items()}
     rows = [
-        [title, *("-" if (v := each[episode][name]) is None else shown(name, v) for each in found.values())]
+        [
+            case.units.titled(*title),
+            *("-" if (v := each[episode][name]) is None else shown(name, v) for each in found.values()),
+        ]
         for (episode, name), title in METRICS.items()
     ]
     each_margins = [margins(case, gains) for gains in of.values()]

@@ -10,12 +10,17 @@ from typing import Any
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
            "--disable-component-update", "--disable-sync"]  # fmt: skip
 # On the live page: of each value of the effort, when its first sample was there, in ms since 1970.
+# Of each value of the effort, when it had been painted, in ms since 1970: two frames after its first sample came.
 WATCH_EFFORT = """
 (() => {
   window.seen = {}
-  const source = [...Bokeh.documents[0].all_models].find((m) => m.name === "effort+applied")
+  const source = [...Bokeh.documents[0].all_models].find((m) => m.name === "setpoint+output+effort+applied")
+  const known = new Set()
   source.streaming.connect(() => {
-    for (const value of source.data.effort) if (!(value in window.seen)) window.seen[value] = Date.now()
+    const fresh = [...new Set(source.data.effort)].filter((value) => !known.has(value))
+    for (const value of fresh) known.add(value)
+    const painted = () => { for (const value of fresh) window.seen[value] = Date.now() }
+    if (fresh.length) requestAnimationFrame(() => requestAnimationFrame(painted))
   })
 })()
 """

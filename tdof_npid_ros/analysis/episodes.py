@@ -21,6 +21,7 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.noise import largest_noise
+from tdof_npid_ros.plotting import Units
 from tdof_npid_ros.responses import ROUNDING, Lane, largest_move
 from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
@@ -96,6 +97,11 @@ class Episode:
     def lanes(self) -> int:
         """Number of independent loops, or of a robot's joints."""
         return int(self.output.shape[1])
+
+    @property
+    def units(self) -> Units:
+        """Of output and effort, where the bag tells."""
+        return Units.of(self.plant)
 
     @property
     def controller(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from tdof_npid_ros.analysis.episodes import Episode, bag_names
 from tdof_npid_ros.control.law import limits_of
-from tdof_npid_ros.plotting import Curve, Panel, draw_responses
+from tdof_npid_ros.plotting import Curve, Panel, common_units, draw_responses
 
 MOST_COLUMNS = 6
 MOST_LANES = 7  # of an episode: as many as there are colours
@@ -65,7 +65,7 @@ def panel(group: str, members: Sequence[Named], bags: Mapping[str, str], legend:
         for name, episode in members
         for lane in range(min(episode.lanes, MOST_LANES))
     ]
-    return Panel(group, curves, limits(members))
+    return Panel(group, curves, limits(members), units=common_units(episode.units for _, episode in members))
 
 
 def limits(members: Sequence[Named]) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from tdof_npid_ros.metrics import DisturbanceMetrics, EffortUse, SetpointMetrics
 from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameters import NOISE, PLANT
 from tdof_npid_ros.plants.catalog import model_parameters
+from tdof_npid_ros.plotting import common_units
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
 from tdof_npid_ros.stability.margins import Margins
 
@@ -46,6 +47,7 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[Any], str]]]] = {
     "deviation": ("off simulation", "{:.3g}".format),
     "m_s": ("M_s", "{:.2f}".format),
 }
+UNITS_OF: Final = {"peak": "{output}", "iae": "{output} s", "effort_variation": "{effort}", "effort_peak": "{effort}"}
 WHICH_ROW = ("bag", "episode", "lane", "joint", "start_s")  # what tells one row from another
 
 
@@ -118,7 +120,8 @@ class Report:
         names = [name for name in COLUMNS if any(row[name] not in (None, "") for row in shown)]
         if all(row["lane"] == 0 or row["joint"] for row in rows):
             names.remove("lane")
-        titles = [COLUMNS[name][0] for name in names]
+        units = common_units(report.episode.units for report in self.episodes)
+        titles = [units.titled(COLUMNS[name][0], UNITS_OF.get(name, "")) for name in names]
         return [titles, *([_shown(row, name) for name in names] for row in shown)], len(rows) - len(shown)
 
     def notes(self) -> list[str]:

@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     loop.add_argument("--step", type=float, metavar="S", help="the largest change of the setpoint")
     loop.add_argument("--at", type=float, metavar="Y", help="the output where it begins, at rest (default: 0)")
     loop.add_argument("--at-effort", type=float, metavar="U", help="the effort there (default: 0)")
-    loop.add_argument("--unit", default="", help="of the output, for the comments: K, rad, m")
+    loop.add_argument("--unit", default="", help="of the output, for axes and tables: K, rad, m")
+    loop.add_argument("--effort-unit", default="", metavar="UNIT", help="of the effort: %%, V, N")
     loop.add_argument("--sample-period", type=float, metavar="H", help="s (default: chosen)")
     loop.add_argument("--controller", default=GAINS["type"].default, metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
 
@@ -104,6 +105,7 @@ def _draft(arguments: argparse.Namespace) -> Draft:
         "step": arguments.step,
         "effort": tuple(arguments.effort or (-math.inf, math.inf)),
         "unit": arguments.unit,
+        "effort_unit": arguments.effort_unit,
         "sample_period": arguments.sample_period,
         "controller": controller_type(arguments.controller),
     }
@@ -157,6 +159,7 @@ def _ask(arguments: argparse.Namespace) -> None:
     low = _answer("least effort of the actuator [no limit]: ", float, -math.inf)
     arguments.effort = (low, _answer("most effort of the actuator [no limit]: ", float, math.inf))
     arguments.unit = _answer("unit of the output []: ", str, "")
+    arguments.effort_unit = _answer("unit of the effort []: ", str, "")
 
 
 def _answer(question: str, kind: Callable[[str], Any], otherwise: Any = None) -> Any:

@@ -91,7 +91,7 @@ class Commissioning:
         for record, stretch, residual in fitted:
             predicted = Curve("model", stretch.time, stretch.output - residual, stretch.effort)
             measured = Curve("measured", stretch.time, stretch.output, stretch.effort, record.setpoint)
-            page.plot(*response_plots(Panel(record.name, [measured, predicted])))
+            page.plot(*response_plots(Panel(record.name, [measured, predicted], units=design.case.units)))
         page.heading(f"The plant: {design.found.structure.text}")
         page.text(design.found.reason)
         intervals = design.found.parameters.items()
@@ -112,7 +112,7 @@ class Commissioning:
                 run = design.case.simulate(episode, gains)
                 if np.abs(run.output).max() < 1e3 * max(1.0, float(np.abs(run.setpoint).max())):
                     curves.append(curve_of(label, run))
-            page.plot(*response_plots(Panel(episode, curves, design.case.effort_limits)))
+            page.plot(*response_plots(Panel(episode, curves, design.case.effort_limits, units=design.case.units)))
         if (step := self.confirmed) is not None:
             page.heading("The confirming step")
             page.text(
@@ -124,7 +124,7 @@ class Commissioning:
                 Curve("measured", step.time, step.output, step.effort, step.setpoint),
                 Curve("predicted", run.time, run.output[:, 0], run.control_effort[:, 0]),
             ]
-            page.plot(*response_plots(Panel("step", curves, design.case.effort_limits)))
+            page.plot(*response_plots(Panel("step", curves, design.case.effort_limits, units=design.case.units)))
         return page
 
 

@@ -20,6 +20,7 @@ from tdof_npid_ros.live.plots import ROLLOVER, LivePlots, at_lane
 from tdof_npid_ros.live.step import Steps
 from tdof_npid_ros.live.tune_controls import TuneControls
 from tdof_npid_ros.live.view import LiveLoop, View, of_lane
+from tdof_npid_ros.plotting import Units
 
 REFRESH_MS = 50  # plots
 LOOK_MS = 500  # numbers, widgets and diagnostics
@@ -57,7 +58,8 @@ class LivePage:
         self._loops = {loop.namespace: loop for loop in loops}
         self._view = view = View(loops[0])
         case = view.loop.case
-        self._plots = LivePlots(self._window(), 1.0 if case is None else case.largest_step or 1.0)
+        step, units = (1.0, Units()) if case is None else (case.largest_step or 1.0, case.units)
+        self._plots = LivePlots(self._window(), step, units)
         self._gains = GainControls(view, keep_in)
         self._hand = Hand(view, self._gains.told)
         self._tune = TuneControls(view)
@@ -122,7 +124,9 @@ class LivePage:
     # Now and then
 
     def refresh(self) -> None:
-        """Send what has come since."""
+        """Send what has come since, unless the browser is not there yet with what it has."""
+        if self._plots.is_behind:
+            return
         observer, lane = self._view.loop.observer, self._view.lane
         rows, self._seen = observer.rows_since(self._seen)
         terms, self._seen_terms = observer.terms_since(self._seen_terms)

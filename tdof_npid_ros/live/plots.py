@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import math
+import time as clock
 from collections.abc import Sequence
 from itertools import repeat
 from typing import Any
 
 import numpy as np
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, Range1d, Span, Title
+from bokeh.models import ColumnDataSource, CustomJS, Range1d, Span, Title
 
 from tdof_npid_ros.control.law import TERMS as LAW_TERMS
 from tdof_npid_ros.graph.observer import Row, Terms
 from tdof_npid_ros.interactive import INK, corners, draw, finish_legend, new_plot
 from tdof_npid_ros.live.step import StepResponse
-from tdof_npid_ros.plotting import GUIDE, PALETTE, Curve, Panel, effort_notes, effort_range, shown_until
+from tdof_npid_ros.plotting import GUIDE, PALETTE, Curve, Panel, Units, effort_notes, effort_range, shown_until
 
 ROLLOVER = 4000  # points of a curve that a browser holds
 MOST_AT_ONCE = 400  # points that one refresh sends; a faster loop is thinned
 LEAST_SHOWN = 0.02  # of a step: an output at rest is a line, not its last digits
+MOST_ROOM = 1.5  # of what is to be shown: a range that is larger is fitted anew, others stay as they are
 MOST_OF_STEP = 1000  # points of a step that are drawn
 SIGNALS = ("setpoint", "output")
 EFFORTS = ("effort", "applied")
 TERMS = ("P", "I", "D")
 STEPS = ("latest step", "the one before")
+TAKEN = "cb_obj.tags = [cb_obj.data.time.at(-1)]"  # a browser tells by a source's tags how far it is
+PATIENCE = 1.0  # s without a word from a browser, after which it is sent more all the same
 
 
 class LivePlots:
@@ -33,27 +37,30 @@ class LivePlots:
     Args:
         window: s that scroll by.
         step: how large a step of the output is, by and large.
+        units: of output and effort.
 
     Attributes:
         layout: what the page shows.
     """
 
-    def __init__(self, window: float, step: float) -> None:
+    def __init__(self, window: float, step: float, units: Units) -> None:
         self._least = LEAST_SHOWN * step
-        self._signals, self._efforts, self._terms = map(_empty, (SIGNALS, EFFORTS, TERMS))
+        self._signals, self._terms = map(_empty, ((*SIGNALS, *EFFORTS), TERMS))
         self._steps = [_empty([name]) for name in STEPS]
+        self._signals.js_on_change("streaming", CustomJS(code=TAKEN))
         self._last: Row | None = None
+        self._sent_at = 0.0
         self._limits = (-math.inf, math.inf)
-        output = new_plot("output", 270, x_label="", name="output_plot")
-        self._effort = effort = new_plot("effort", 190, x_label="", x_range=output.x_range)
+        output = new_plot(units.titled("output", "{output}"), 270, x_label="", name="output_plot")
+        self._effort = effort = new_plot(units.titled("effort", "{effort}"), 190, x_label="", x_range=output.x_range)
         terms = new_plot("P, I, D", 190, x_range=output.x_range)
         self._output, self._parts = output, terms
         output.y_range, effort.y_range, terms.y_range = (Range1d(-1.0, 1.0) for _ in range(3))
         after_step = new_plot("part of the step", 240, x_label="time since the step (s)")
         draw(output, self._signals, "setpoint", color=GUIDE, dash="dashed", width=1.4)
         draw(output, self._signals, "output", color=PALETTE[0])
-        draw(effort, self._efforts, "effort", color=PALETTE[1])
-        draw(effort, self._efforts, "applied", color=PALETTE[2], dash="dotted", width=1.6)
+        draw(effort, self._signals, "effort", color=PALETTE[1])
+        draw(effort, self._signals, "applied", color=PALETTE[2], dash="dotted", width=1.6)
         for name, colour in zip(TERMS, PALETTE, strict=False):
             draw(terms, self._terms, name, color=colour, width=1.6)
         draw(after_step, self._steps[1], STEPS[1], color=GUIDE, dash="dashed", width=1.6)
@@ -68,37 +75,40 @@ class LivePlots:
             finish_legend(plot)
         for plot in (effort, terms, after_step):
             plot.toolbar_location = None
+        output.x_range.syncable = False  # where a browser has scrolled to is its own matter
         output.x_range.follow, output.x_range.follow_interval, output.x_range.range_padding = "end", window, 0.0
         self.layout = column(output, effort, terms, after_step, name="plots", sizing_mode="stretch_width")
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether the browser is still at what it was sent last: on a busy machine, more would only wait in a queue."""
+        waits = self._signals.tags and self._last is not None and self._signals.tags != [self._last.time]
+        return bool(waits) and clock.monotonic() - self._sent_at < PATIENCE
+
     def clear(self) -> None:
         """Begin anew, with another loop or lane."""
-        for source in (self._signals, self._efforts, self._terms, *self._steps):
+        for source in (self._signals, self._terms, *self._steps):
             source.data = {name: [] for name in source.data}
         self._last = None
 
     def add(self, rows: Sequence[Row], lane: int) -> None:
         """Go on with answers; of many at once, some."""
         rows = _some(rows)
-        time = [one.time for one in rows]
-        self._signals.stream(
-            {
-                "time": time,
-                "setpoint": [at_lane(one.setpoint, lane) for one in rows],
-                "output": [at_lane(one.output, lane) for one in rows],
-            },
-            rollover=ROLLOVER,
-        )
         held = rows if self._last is None else [self._last, *rows]
         times = np.array([one.time for one in held])
-        efforts: dict[str, Any] = {}
-        for name, values in (("effort", [one.effort for one in held]), ("applied", [one.applied for one in held])):
-            efforts["time"], efforts[name] = corners(times, np.array([at_lane(value, lane) for value in values]))
+        streamed: dict[str, Any] = {}
+        for name in (*SIGNALS, *EFFORTS):
+            values = np.array([at_lane(getattr(one, name), lane) for one in held])
+            ends = (np.repeat(times, 2)[1:], np.repeat(values, 2)[1:]) if name == "output" else corners(times, values)
+            streamed["time"], streamed[name] = ends
+        begun = 0 if self._last is None else 1  # the last answer's own point is there already
+        # As lists, they are one message, as arrays one more for each; and one source, as each makes the browser draw.
+        self._signals.stream(
+            {name: values[begun:].tolist() for name, values in streamed.items()}, rollover=2 * ROLLOVER
+        )
         both = np.array([self._signals.data[name] for name in SIGNALS], dtype=float)
         _fit(self._output, float(np.nanmin(both)), float(np.nanmax(both)), self._least)
-        begun = 0 if self._last is None else 1  # the last answer's own point is there already
-        self._efforts.stream({name: values[begun:] for name, values in efforts.items()}, rollover=2 * ROLLOVER)
-        self._last = rows[-1]
+        self._last, self._sent_at = rows[-1], clock.monotonic()
 
     def add_terms(self, terms: Sequence[Terms], lane: int) -> None:
         """Go on with the law's terms."""
@@ -116,7 +126,9 @@ class LivePlots:
                 time = np.array(one.time[::stride])
                 part = (np.array(one.output[::stride]) - one.before) / (one.after - one.before)
                 shown = time <= shown_until(Panel("", [Curve("", time, part, part)]))
-                source.data = {"time": time[shown], name: part[shown]}
+                data = {"time": time[shown], name: part[shown]}
+                if not all(np.array_equal(values, source.data[key]) for key, values in data.items()):
+                    source.data = data
 
     def fit_effort(self, limits: tuple[float, float], gain: float) -> None:
         """Show the effort's limits where there are any, and a range that a kick of few samples does not flatten.
@@ -128,7 +140,7 @@ class LivePlots:
             self._limits = limits
             for span, limit in zip(self._spans, limits, strict=True):
                 span.location = limit if math.isfinite(limit) else math.nan
-        panel = _panel(self._efforts, ("effort",), limits)
+        panel = _panel(self._signals, ("effort",), limits)
         if panel is None:
             return
         low, high, _ = effort_range(panel, math.inf)
@@ -152,9 +164,10 @@ def _fit(plot: Any, low: float, high: float, least: float) -> None:
     """Show from `low` to `high`, at least so much of it, and a little more."""
     if not math.isfinite(low + high):
         return
-    room = max(0.05 * (high - low), 0.5 * (least - (high - low)))
-    if (low - room, high + room) != (plot.y_range.start, plot.y_range.end):
-        plot.y_range.update(start=low - room, end=high + room)
+    room = max(0.1 * (high - low), 0.5 * (least - (high - low)))
+    shown = plot.y_range
+    if low < shown.start or shown.end < high or shown.end - shown.start > MOST_ROOM * (high - low + 2.0 * room):
+        shown.update(start=low - room, end=high + room)
 
 
 def _empty(columns: Sequence[str]) -> ColumnDataSource:

@@ -324,3 +324,15 @@ def test_a_turn_goes_the_short_way_and_its_iae_is_that_of_the_sampled_loop(
     exact = 0.01 * (sum(error) - (error[0] + error[-1]) / 2)
     assert found["setpoint"]["iae"] == pytest.approx(exact, rel=1e-9)  # type: ignore[index]
     assert exact == pytest.approx(0.99 * first / 2, rel=1e-6)
+
+
+def test_units_are_beside_the_numbers_and_on_the_axes(tmp_path: Path) -> None:
+    file, page = str(tmp_path / "heater.yaml"), tmp_path / "page.html"
+    facts = "--gain 0.8 --time-constant 180 --dead-time 25 --step 40 --unit K --effort-unit %"
+    assert main(["new", file, *facts.split()]) == 0
+    assert main(["simulate", file, "--html", str(page), "--plot", str(tmp_path / "axes.svg")]) == 0
+    told = page.read_text("utf-8")
+    for title in ("setpoint: IAE (K s)", "disturbance: peak (K)", "largest |u| (%)", '"output (K)"', '"effort (%)"'):
+        assert title in told, title
+    picture = (tmp_path / "axes.svg").read_text("utf-8")
+    assert "output y (K)" in picture and "effort u (%)" in picture

@@ -1,4 +1,4 @@
-"""A step is on the page no later than 200 ms after it happened."""
+"""A step is seen on the page no later than 200 ms after it happened."""
 
 from __future__ import annotations
 
