@@ -46,7 +46,8 @@ TEST = [
     "mcap-ros2-support",
     "playwright",
     "sphinx>=7",
-    "myst-parser>=3",
+    "myst-nb>=1",
+    "ipykernel<7",  # 7 warns of each kernel that its port is not encrypted
     "twine",
     "colcon-core",
     "colcon-ros",

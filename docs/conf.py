@@ -12,10 +12,13 @@ author = "the tdof_npid_ros developers"
 copyright = "Apache-2.0"
 release = "0.1.0"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
-source_suffix = {".md": "markdown"}
+source_suffix = {".md": "myst-nb"}
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 200  # s, of a cell: the first run compiles
 exclude_patterns = ["_build"]
 suppress_warnings = ["myst.header"]
 autodoc_typehints = "description"

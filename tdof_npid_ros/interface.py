@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +16,8 @@ from tdof_npid_ros.control.gains import PER_LANE, ControllerType, Gains, GainsEr
 from tdof_npid_ros.loop import Trajectory
 from tdof_npid_ros.robustness.result import RobustResult, sweep_plants
 from tdof_npid_ros.robustness.spread import Sampling, spreads_of
+from tdof_npid_ros.tuning.judge import Constraints
+from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import TuningResult, tune_case
 from tdof_npid_ros.workers import workers
 
@@ -84,15 +86,19 @@ def tune(
 ) -> TuningResult:
     """Find the gains with the least IAE_SP + weight · IAE_DIS, equation (10), by the hybrid genetic algorithm.
 
+    What the case asks its tuner for holds here, too: its weight, margins (`ms`, …) and what it frees.
+
     Args:
         case: with the episodes `setpoint` and `disturbance`, and bounds.
         controller: pid, npid, tdof_npid1 or tdof_npid2; None: the case's.
         seed: the same seed gives the same result, bit for bit.
         weight: None: the case's.
-        options: of `tdof_npid_ros.tuning.study.tune_case`: population, generations, extra=("sigma",), …
+        options: margins that the loop must have, in place of the case's (ms, mt, gain_margin, phase_margin in degrees,
+            delay_margin in s), and those of `tdof_npid_ros.tuning.study.tune_case`: population, generations,
+            extra=("sigma",) to free sigma, …
 
     Returns:
-        `gains`, `objective`, `evaluations`, `improvements`.
+        `gains`, `objective`, `evaluations`, `improvements`; `feasible`: whether the loop has these margins.
 
     Raises:
         TuningError: a bound is missing, or an option is wrong.
@@ -106,7 +112,11 @@ def tune(
     """
     if weight is not None:
         case = replace(case, weight=weight)
-    return tune_case(case, controller or case.gains.type, seed=seed, **options)
+    controller = controller or case.gains.type
+    asked = TuningProblem.of_case(case, controller)
+    given = {field.name: options.pop(field.name) for field in fields(Constraints) if field.name in options}
+    how: dict[str, Any] = {"extra": asked.extra, "constraints": replace(asked.constraints, **given), **options}
+    return tune_case(case, controller, seed=seed, **how)
 
 
 def robust(

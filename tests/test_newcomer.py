@@ -66,13 +66,14 @@ def test_from_a_few_facts_to_a_verified_loop(
 
     number, domain = reserved_domain()
     with domain:
-        command = [sys.executable, "-m", "tdof_npid_ros", "run", file, "--bag", "bags/first", "--json"]
+        command = [sys.executable, "-m", "tdof_npid_ros", "run", file, "--gains", "tuned.yaml"]
+        command += ["--bag", "bags/first", "--json"]
         environment = {**os.environ, "ROS_DOMAIN_ID": str(number)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     case = ["--case", file] if name == "tank" else []
     report = told("analyze", "bags/first", "--html", "report.html", *case)
     measured = [response for one in report["episodes"] for response in one["lanes"][0]["responses"]]
-    assert [one["iae"] for one in measured] == [first["setpoint"]["iae"], first["disturbance"]["iae"]]
+    assert [one["iae"] for one in measured] == [tuned["setpoint"]["iae"], tuned["disturbance"]["iae"]]
     assert Path("report.html").stat().st_size > 100_000
     assert [one["sound"] for one in told("verify", "bags/first", *case)["bags"]] == [True]

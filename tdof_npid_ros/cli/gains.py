@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tdof_npid_ros.case import Case
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import (
     CONTROLLER_TYPES,
     PER_LANE,
@@ -41,6 +41,18 @@ def chosen_gains(case: Case, arguments: argparse.Namespace) -> Gains:
     """
     overrides = {name: getattr(arguments, name) for name in PER_LANE if getattr(arguments, name) is not None}
     return gains_by_source(case, arguments.controller, arguments.gains).with_values(**overrides)
+
+
+def asked_for(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The type and gains as a controller's parameters, where the arguments ask for some of their case; else nothing.
+
+    Raises:
+        ParameterFileError, GainsError: as `chosen_gains`.
+    """
+    if all(getattr(arguments, name) is None for name in ("controller", "gains", *PER_LANE)):
+        return {}
+    gains = chosen_gains(load_case(arguments.case), arguments)
+    return {name: getattr(gains, name) for name in ("type", *PER_LANE)}
 
 
 def gains_by_source(case: Case, kind: str | None, source: str | None) -> Gains:

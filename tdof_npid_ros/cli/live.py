@@ -11,7 +11,8 @@ import webbrowser
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import FrameType
-from typing import Any
+
+from tdof_npid_ros.cli.gains import add_gain_arguments, asked_for
 
 NAMESPACE = "/live"
 
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAMESPACE",
         help="look on loops that run already, started by anybody; with a case, it is theirs",
     )
+    add_gain_arguments(parser)
     parser.add_argument("--mode", choices=("realtime", "lockstep"), default="realtime", help="default: realtime")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="simulated seconds a second (default: 1)")
     parser.add_argument("--bag", type=Path, metavar="DIR", help="record to this new folder from the start")
@@ -49,6 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     case = None if arguments.case is None else load_case(arguments.case)
     path = None if arguments.case is None else find_parameter_file(arguments.case)
+    given = {} if arguments.case is None else asked_for(arguments)
+    if given and arguments.join:
+        raise ValueError("gains of a loop that runs are set in it: tdof-npid set, or on the page")
     namespaces = arguments.join or [NAMESPACE]
     stopped: list[int] = []
 
@@ -62,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.join is None and case is not None and path is not None:
             stay_on_this_machine()
             processes = stack.enter_context(NodeProcesses(path, NAMESPACE))
-            given: dict[str, Any] = {"mode": arguments.mode, "speed": arguments.speed}
+            given |= {"mode": arguments.mode, "speed": arguments.speed}
             plays = arguments.mode == "lockstep"
             # Until somebody steps the setpoint, the loop stays where the plant begins.
             stays = not plays and "setpoint" not in read_parameters(path, "controller")

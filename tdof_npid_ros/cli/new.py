@@ -21,6 +21,8 @@ from tdof_npid_ros.plants.catalog import make_plant, named_model
 from tdof_npid_ros.plants.ode import Ode
 from tdof_npid_ros.stability.margins import margins
 
+RUN = "run {0} --gains tuned.yaml --bag bags/first"
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
@@ -68,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({"file": str(path), "sample_period": draft.period, "horizon_s": draft.horizon, **first}))
     else:
         print(f"written: {path}")
-        for line in ("check {0}", "simulate {0} --plot response.png", "tune {0} --out tuned.yaml"):
+        for line in ("check {0}", "simulate {0} --plot response.png", "tune {0} --out tuned.yaml", RUN):
             print(f"next     tdof-npid {line.format(path)}")
     return 0
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from tqdm import tqdm
 
+from tdof_npid_ros.cli.gains import add_gain_arguments, asked_for
+
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.running import RunningLoop
 
@@ -20,6 +22,7 @@ REDRAWN = 0.25  # s between redrawings, so that a log of them stays readable
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
+    add_gain_arguments(parser)
     parser.add_argument("--bag", type=Path, metavar="DIR", help="record to this new folder")
     parser.add_argument("--realtime", action="store_true", help="on a steady clock (default: the file's mode)")
     parser.add_argument("--for", type=float, dest="seconds", metavar="S", help="stop after so many seconds")
@@ -36,7 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     mode: Literal["realtime"] | None = "realtime" if arguments.realtime else None
     if not arguments.json:
         print("Starting plant, controller and scenario …", flush=True)
-    with running(arguments.case, bag=arguments.bag, mode=mode, namespace=arguments.namespace) as loop:
+    options = {"bag": arguments.bag, "mode": mode, "namespace": arguments.namespace}
+    with running(arguments.case, **options, **asked_for(arguments)) as loop:
         if not loop.case.episodes:
             raise ValueError(f"{arguments.case}: no episodes in it to play: give the scenario some")
         finished = _play(loop, arguments.seconds, quiet=arguments.json)

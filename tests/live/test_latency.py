@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def test_a_step_is_shown_within_200_ms(tmp_path: Path) -> None:
                     run(0.1, value)
                 run(1.0, 0.5)  # for what is on its way
                 seen = {float(value): at / 1000 for value, at in page.evaluate("Object.entries(window.seen)")}
-                late.append(sorted(seen[value] - published[value] for value in values))
+                late.append(sorted(seen.get(value, math.inf) - published[value] for value in values))
                 if late[-1][-1 - MOST_LATE] <= LATEST_S:
                     break
         told = [f"median {1000 * one[STEPS // 2]:.0f} ms, at most {1000 * one[-1]:.0f} ms" for one in late]

@@ -11,7 +11,7 @@ from live_program import CHROMIUM, Program, eventually, model, needs_chromium, o
 
 from tdof_npid_ros.case import load_case
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = pytest.mark.timeout(480)
 TWO_LANES = """
 /**: {ros__parameters: {sample_period: 0.01, mode: realtime}}
 plant: {ros__parameters: {model: first_order, gain: 2.0, time_constant: 0.5, lanes: 2}}
@@ -30,7 +30,9 @@ def test_gains_are_tuned_looked_at_and_only_then_applied(tmp_path: Path) -> None
             page.get_by_role("button", name="tune", exact=True).click()
             eventually(lambda: "evaluations" in str(model(page, "tuning", "w.text")), "progress is told")
             told = lambda: str(model(page, "tuning", "w.text"))  # noqa: E731
-            eventually(lambda: model(page, "proposal", "w.visible"), told)
+            while not model(page, "proposal", "w.visible"):  # behind all else on this machine: as long as it goes on
+                before = told()
+                eventually(lambda before=before: told() != before or model(page, "proposal", "w.visible"), told)
             assert program.tdof_npid("get", "kp")["kp"] == published
             texts = str(model(page, "proposal", "w.children.map(c => c.text ?? '').join()"))
             for fact in ("overshoot", "M_<wbr>s", "delay margin", "now", "tuned", "kp"):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tdof_npid_ros import margins, tune
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from tdof_npid_ros.paper.tuned import tuned
@@ -39,6 +40,15 @@ def test_a_study_spends_its_budget_and_no_more() -> None:
     assert result.objective == result.improvements[-1].value
     values = [(one.violation, one.value) for one in result.improvements]
     assert values == sorted(values, reverse=True)
+
+
+def test_from_python_the_case_s_margins_hold_too_and_others_in_their_place() -> None:
+    asked = replace(CASE, search={"ms": 1.5, "free": "sigma"})
+    for given, limit in (({}, 1.5), ({"ms": 1.3}, 1.3)):
+        result = tune(asked, "tdof_npid1", population=10, generations=20, **given)
+        m_s = margins(asked, result.gains).m_s
+        assert m_s is not None and m_s <= limit + 1e-6
+        assert result.gains.sigma != CASE.gains.sigma
 
 
 def test_the_result_is_the_best_candidate_that_was_told() -> None:
