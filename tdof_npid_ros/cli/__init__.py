@@ -34,7 +34,7 @@ SUBCOMMANDS = {
     "certify": "whether a loop is proved to come to rest from every state, and what is not claimed",
     "tune": "find the gains of a case with the hybrid genetic algorithm",
     "robust": "how gains do on thousands of plants near the model",
-    "pareto": "the trade-off between tracking and rejection (the paper's Figure 6)",
+    "pareto": "the trade-off between tracking and rejection, of a case or of the paper's Figure 6",
     "reproduce": "every table and figure of the paper, published beside ours",
     "identify": "a plant's model from a recording, with what the recording cannot tell",
     "analyze": "metrics and pictures of the episodes in bags",

@@ -1,4 +1,4 @@
-"""`tdof-npid pareto`: fronts of tracking against rejection (the paper's Figure 6)."""
+"""`tdof-npid pareto`: fronts of tracking against rejection, of a case or of the paper's Figure 6."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.scheduler import add_scheduler_argument
 from tdof_npid_ros.cli.tune import add_constraint_arguments, constraints_of
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType, controller_type
@@ -21,10 +22,11 @@ from tdof_npid_ros.tuning.pareto import (
     RATIOS,
     Front,
     FrontSearch,
+    Loop,
+    case_of,
     chain_points,
     chains_of,
     check_installed,
-    foptd_case,
     fronts_of,
 )
 from tdof_npid_ros.workers import ChunkCheckpoint, Workers, workers
@@ -35,7 +37,10 @@ SUBCOMMAND = "pareto"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument(
-        "--ratio", type=float, nargs="+", default=list(RATIOS), metavar="L/T", help="default: 0.1 0.5 1"
+        "case", nargs="?", help="a case (p1-c0.5, …) or the path of a parameter file (default: Figure 6's loops)"
+    )
+    parser.add_argument(
+        "--ratio", type=float, nargs="+", metavar="L/T", help="of Figure 6's loops (default: 0.1 0.5 1)"
     )
     parser.add_argument(
         "--controller", nargs="+", default=list(CONTROLLER_TYPES), metavar="TYPE", help="default: all four"
@@ -47,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--write",
         type=Path,
         metavar="FILE",
-        help="write one point as a ROS parameter file (one --ratio and --controller)",
+        help="write one point as a ROS parameter file (of one front)",
     )
     add_constraint_arguments(parser)
     add_scheduler_argument(parser)
@@ -64,21 +69,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Find the fronts, print them, and write what was asked for."""
     controllers = [controller_type(name) for name in dict.fromkeys(arguments.controller)]
-    ratios = list(dict.fromkeys(arguments.ratio))
-    _refuse_bad_arguments(arguments, len(controllers) * len(ratios))
+    if arguments.case is not None and arguments.ratio is not None:
+        raise TuningError("--ratio is of Figure 6's loops: give it, or a case")
+    case = None if arguments.case is None else load_case(arguments.case)
+    loops: list[Loop] = list(dict.fromkeys(arguments.ratio or RATIOS)) if case is None else [case]
+    _refuse_bad_arguments(arguments, len(controllers) * len(loops))
     check_installed()
-    for ratio in ratios:
-        foptd_case(ratio)
+    for loop in loops:
+        case_of(loop)
     if arguments.out:
         claim_folder(arguments.out, SUBCOMMAND)
-    search = FrontSearch(arguments.seed, arguments.generations, constraints_of(arguments))
+    search = FrontSearch(arguments.seed, arguments.generations, constraints_of(arguments, case))
     with workers(arguments.scheduler) as where:
         if arguments.out:
-            with kept_until_written(arguments.out, _work(search, ratios, controllers)) as checkpoint:
-                fronts = _find(search, ratios, controllers, where, checkpoint)
+            with kept_until_written(arguments.out, _work(search, loops, controllers)) as checkpoint:
+                fronts = _find(search, loops, controllers, where, checkpoint)
                 _write(fronts, arguments.out)
         else:
-            fronts = _find(search, ratios, controllers, where)
+            fronts = _find(search, loops, controllers, where)
     rows = [row for front in fronts for row in front.rows()]
     if arguments.write:
         weight = 1.0 if arguments.weight is None else arguments.weight
@@ -105,7 +113,8 @@ def _refuse_bad_arguments(arguments: argparse.Namespace, fronts: int) -> None:
         return
     if fronts != 1:
         raise TuningError(
-            f"--write takes a point of one front, but there are {fronts}: give one --ratio and --controller"
+            f"--write takes a point of one front, but there are {fronts}: give one --controller, and one --ratio or "
+            "a case"
         )
     if path.exists():
         raise TuningError(f"{path} exists: give another file")
@@ -114,25 +123,26 @@ def _refuse_bad_arguments(arguments: argparse.Namespace, fronts: int) -> None:
 
 def _find(
     search: FrontSearch,
-    ratios: list[float],
+    loops: list[Loop],
     controllers: list[ControllerType],
     where: Workers,
     checkpoint: ChunkCheckpoint | None = None,
 ) -> list[Front]:
-    """The fronts by ratio and type, in the order in which they were asked for."""
-    chains = chains_of(ratios, controllers)
+    """The fronts by loop and type, in the order in which they were asked for."""
+    chains = chains_of(loops, controllers)
     search = search._replace(threads=where.threads_in(len(chains)))
     sizes = [len(chain.controllers) for chain in chains]
     points = where.map(chain_points, search, chains, unit="front", sizes=sizes, checkpoint=checkpoint)
     fronts = fronts_of(chains, points)
+    ratios = [None if isinstance(loop, Case) else loop for loop in loops]
     return [fronts[ratio, controller] for ratio in ratios for controller in controllers]
 
 
-def _work(search: FrontSearch, ratios: list[float], controllers: list[ControllerType]) -> dict[str, Any]:
+def _work(search: FrontSearch, loops: list[Loop], controllers: list[ControllerType]) -> dict[str, Any]:
     """What the fronts depend on, as JSON holds it."""
     constraints = search.constraints.given if search.constraints else {}
     return {
-        "fronts": ratios,
+        "fronts": [repr(loop.parameters()) if isinstance(loop, Case) else loop for loop in loops],
         "controllers": controllers,
         "seed": search.seed,
         "generations": search.generations,
@@ -153,10 +163,10 @@ def _write(fronts: list[Front], folder: Path) -> None:
 
 
 def _table(fronts: list[Front]) -> str:
-    lines = [f"{'L/T':>6} {'controller':12}{'points':>8}{'IAE_SP':>18}{'IAE_DIS':>20}{'least sum':>12}"]
+    lines = [f"{'loop':12}{'controller':12}{'points':>8}{'IAE_SP':>18}{'IAE_DIS':>20}{'least sum':>12}"]
     for front in fronts:
         lines.append(
-            f"{front.ratio:6g} {front.controller:12}{len(front.gains):8d}"
+            f"{front.title:12}{front.controller:12}{len(front.gains):8d}"
             + "".join(
                 f"{low:12.4f} .. {high:.4f}"
                 for low, high in zip(front.iae.min(axis=0), front.iae.max(axis=0), strict=True)

@@ -120,7 +120,8 @@ def front_claims(fronts: Sequence[Front]) -> Table:
     """The paper's three facts about Figure 6, in numbers."""
     lines: list[tuple[Cell, ...]] = []
     by_ratio = {
-        ratio: {f.controller: f for f in fronts if f.ratio == ratio} for ratio in sorted({f.ratio for f in fronts})
+        ratio: {f.controller: f for f in fronts if f.ratio == ratio}
+        for ratio in sorted({f.ratio for f in fronts if f.ratio})
     }
     for ratio, of in by_ratio.items():
         objective = {name: float(front.iae[front.best()].sum()) for name, front in of.items()}
@@ -140,7 +141,7 @@ def front_claims(fronts: Sequence[Front]) -> Table:
 
 def front_statements(fronts: Sequence[Front]) -> tuple[str, ...]:
     """The same in words."""
-    ratios = sorted({front.ratio for front in fronts})
+    ratios = sorted({front.ratio for front in fronts if front.ratio})
     of = {(front.ratio, front.controller): front for front in fronts}
     least = {key: float(front.iae[front.best()].sum()) for key, front in of.items()}
     lags = min(dominated_fraction(of[ratio, "pid"], front) for (ratio, name), front in of.items() if name != "pid")

@@ -75,15 +75,16 @@ def draw_error_scaling(error: np.ndarray, scaled: Mapping[float, np.ndarray], pa
 
 
 def draw_fronts(fronts: Sequence[Front], path: Path) -> None:
-    """Figure 6: the fronts of each ratio L/T in axes of their own."""
-    ratios = sorted({front.ratio for front in fronts})
-    canvas, axes = _canvas(1, len(ratios), 3.8)
-    for ratio, ax in zip(ratios, axes[0], strict=True):
-        for front in (front for front in fronts if front.ratio == ratio):
+    """Figure 6: the fronts of each loop in axes of their own, by their ratio L/T."""
+    titles = {front.title: front for front in sorted(fronts, key=lambda front: front.ratio or 0.0)}
+    canvas, axes = _canvas(1, len(titles), 3.8)
+    for title, ax in zip(titles, axes[0], strict=True):
+        for front in (front for front in fronts if front.title == title):
             style = STYLE[front.controller]
             ax.plot(*front.iae.T, linewidth=0.8, markersize=3.0, label=CONTROLLER_TITLES[front.controller], **style)
-        ax.set(xlabel="IAE_SP (s)", ylabel="IAE_DIS (s)")
-        ax.set_title(f"L/T = {ratio:g}", fontsize=TITLE_SIZE)
+        unit, units = "s" if titles[title].ratio else "{output} s", titles[title].case.units
+        ax.set(xlabel=units.titled("IAE_SP", unit), ylabel=units.titled("IAE_DIS", unit))
+        ax.set_title(title, fontsize=TITLE_SIZE)
     axes[0][-1].legend(frameon=False)
     canvas.savefig(path)
 

@@ -1,7 +1,7 @@
 """The trade-off between tracking and rejection (the paper's Figure 6): NSGA-II on (IAE_SP, IAE_DIS).
 
-The plant is K e^(-Ls) / (1 + Ts) with K = 1, T = 1 s and a chosen ratio L/T; σ = 1, N = 10. NSGA-II is pymoo's; a
-generation is one call of the compiled loop.
+The loop is a case's, or the paper's: K e^(-Ls) / (1 + Ts) with K = 1, T = 1 s and a chosen ratio L/T; σ = 1, N = 10.
+NSGA-II is pymoo's; a generation is one call of the compiled loop.
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ SAMPLES_PER_DEAD_TIME = 100
 SETTLED_AFTER = 8.0  # s beyond 14 dead times: the episode's length
 DEAD_TIMES = 14.0
 
+Loop = float | Case
+"""What a front belongs to: a ratio L/T of Figure 6, or a case."""
+
 
 @dataclass(frozen=True)
 class Front:
@@ -52,16 +55,21 @@ class Front:
 
     Attributes:
         case: the loop that it belongs to.
-        ratio: L/T.
+        ratio: L/T; None: of a case that is not the paper's.
         gains: of each point, by increasing IAE_SP.
         iae: IAE_SP and IAE_DIS, (points, 2), in s.
     """
 
     case: Case
     controller: ControllerType
-    ratio: float
+    ratio: float | None
     gains: tuple[Gains, ...]
     iae: Array
+
+    @property
+    def title(self) -> str:
+        """Of which loop it is."""
+        return self.case.name if self.ratio is None else f"L/T = {self.ratio:g}"
 
     def best(self, weight: float = 1.0) -> int:
         """Index of the point with the lowest objective (10)."""
@@ -71,6 +79,7 @@ class Front:
         """One mapping per point: where it lies and its gains."""
         return [
             {
+                "case": self.case.name,
                 "ratio": self.ratio,
                 "controller": self.controller,
                 "index": i,
@@ -90,6 +99,8 @@ class Front:
         if not 0 <= index < len(self.gains):
             raise TuningError(f"no point {index} on the front of {self.controller}: it has 0 to {len(self.gains) - 1}")
         gains, period = self.gains[index], self.case.sample_period
+        if self.ratio is None:
+            return self.case.parameters(gains)
         return {
             "plant": {"model": self.case.model, **self.case.plant_values, "sample_period": period, "mode": "lockstep"},
             "controller": {
@@ -136,7 +147,7 @@ def foptd_case(ratio: float) -> Case:
 
 
 def pareto_front(
-    ratio: float,
+    loop: Loop,
     controller: ControllerType,
     *,
     seed: int = 0,
@@ -152,9 +163,9 @@ def pareto_front(
     random points; and no point of the front is worse than those.
 
     Args:
-        ratio: L/T.
+        loop: a ratio L/T, or a case, of whose tuner's parameters bounds, freed gains and margins hold here, too.
         seed: not negative.
-        constraints: margins that each point must have; see `Judge` for what else it must be.
+        constraints: margins that each point must have, None: the case's; see `Judge` for what else it must be.
         poorer: the front of the type in `POORER`, which this type contains; found here if it is not given.
         threads: by default one per core; the front does not depend on it.
 
@@ -164,10 +175,11 @@ def pareto_front(
     if seed < 0 or population < 4 or generations < 1:
         raise TuningError(f"seed {seed}, population {population}, generations {generations}: at least 0, 4 and 1")
     check_installed()
-    constraints = constraints or Constraints()
+    case = case_of(loop)
+    constraints = constraints or Constraints.of_search(case.search)
     if poorer is None and controller in POORER:
         poorer = pareto_front(
-            ratio,
+            loop,
             POORER[controller],
             seed=seed,
             population=population,
@@ -175,10 +187,8 @@ def pareto_front(
             constraints=constraints,
             threads=threads,
         )
-    case = foptd_case(ratio)
-    problem = TuningProblem(
-        case, controller, constraints=constraints, seed=seed, generations=max(LEAST_FOR_ENDS, generations // 4)
-    )
+    asked = TuningProblem.of_case(case, controller, seed=seed, generations=max(LEAST_FOR_ENDS, generations // 4))
+    problem = replace(asked, constraints=constraints)
     objective, space = Objective(problem, threads), problem.space
     known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem, threads), *(poorer.gains if poorer else ()))]
     starts = np.reshape(known, (-1, len(problem.names)))
@@ -194,11 +204,20 @@ def pareto_front(
     iae, violation = costs(candidates) if len(candidates) else (np.empty((0, 2)), np.empty(0))
     candidates, iae = candidates[violation == 0.0], iae[violation == 0.0]
     if not len(candidates):
-        raise TuningError(f"L/T = {ratio:g}: no {controller} was found that is allowed: ask for less, or search longer")
+        raise TuningError(f"{case.name}: no {controller} was found that is allowed: ask for less, or search longer")
     best = ~np.any(np.all(iae[None] <= iae[:, None], axis=2) & np.any(iae[None] < iae[:, None], axis=2), axis=1)
     _, first = np.unique(iae[best], axis=0, return_index=True)
     candidates, iae = candidates[best][first], iae[best][first]
-    return Front(case, controller, ratio, tuple(problem.gains(one) for one in candidates), iae)
+    return Front(case, controller, _ratio(loop), tuple(problem.gains(one) for one in candidates), iae)
+
+
+def case_of(loop: Loop) -> Case:
+    """The loop as a case."""
+    return loop if isinstance(loop, Case) else foptd_case(loop)
+
+
+def _ratio(loop: Loop) -> float | None:
+    return None if isinstance(loop, Case) else loop
 
 
 class FrontSearch(NamedTuple):
@@ -211,50 +230,46 @@ class FrontSearch(NamedTuple):
 
 
 class FrontChain(NamedTuple):
-    """Fronts of one ratio that are found one after the other, each from the one before."""
+    """Fronts of one loop that are found one after the other, each from the one before."""
 
-    ratio: float
+    loop: Loop
     controllers: tuple[ControllerType, ...]
 
 
-def chains_of(ratios: Sequence[float], controllers: Sequence[ControllerType]) -> list[FrontChain]:
-    """The fronts of each ratio and controller type, in chains that are independent of each other; the longest first."""
+def chains_of(loops: Sequence[Loop], controllers: Sequence[ControllerType]) -> list[FrontChain]:
+    """The fronts of each loop and controller type, in chains that are independent of each other; the longest first."""
     nested = {*POORER, *POORER.values()}
     kinds = [
         tuple(one for one in CONTROLLER_TYPES if one in controllers and (one in nested) == wanted)
         for wanted in (True, False)
     ]
-    return [FrontChain(ratio, kind) for kind in kinds if kind for ratio in ratios]
+    return [FrontChain(loop, kind) for kind in kinds if kind for loop in loops]
 
 
 def chain_points(search: FrontSearch, chain: FrontChain) -> list[dict[str, Array]]:
     """A chunk of work: of each front of a chain, `gains` (points, len(PER_LANE)) and `iae` (points, 2)."""
     fronts: list[Front] = []
     for controller in chain.controllers:
-        poorer = poorer_of(fronts, chain.ratio, controller)
-        fronts.append(pareto_front(chain.ratio, controller, poorer=poorer, **search._asdict()))
+        poorer = next((front for front in fronts if front.controller == POORER.get(controller)), None)
+        fronts.append(pareto_front(chain.loop, controller, poorer=poorer, **search._asdict()))
     return [
         {"gains": np.array([[getattr(gains, name) for name in PER_LANE] for gains in front.gains]), "iae": front.iae}
         for front in fronts
     ]
 
 
-def fronts_of(chains: Sequence[FrontChain], points: Sequence[list[dict[str, Array]]]) -> dict[tuple[float, str], Front]:
-    """The fronts of chains from what `chain_points` gave, by ratio and controller type."""
-    fronts: dict[tuple[float, str], Front] = {}
+def fronts_of(
+    chains: Sequence[FrontChain], points: Sequence[list[dict[str, Array]]]
+) -> dict[tuple[float | None, str], Front]:
+    """The fronts of chains from what `chain_points` gave, by ratio (None: a case's) and controller type."""
+    fronts: dict[tuple[float | None, str], Front] = {}
     for chain, found in zip(chains, points, strict=True):
-        case = foptd_case(chain.ratio)
+        case, ratio = case_of(chain.loop), _ratio(chain.loop)
         for controller, one in zip(chain.controllers, found, strict=True):
             lanes = [dict(zip(PER_LANE, row, strict=True)) for row in one["gains"].tolist()]
             gains = tuple(case.gains.with_values(type=controller, **lane) for lane in lanes)
-            fronts[chain.ratio, controller] = Front(case, controller, chain.ratio, gains, one["iae"])
+            fronts[ratio, controller] = Front(case, controller, ratio, gains, one["iae"])
     return fronts
-
-
-def poorer_of(fronts: Sequence[Front], ratio: float, controller: ControllerType) -> Front | None:
-    """Of fronts found with the same arguments, that of the type which this one contains, if it is there."""
-    kind = POORER.get(controller)
-    return next((front for front in fronts if (front.ratio, front.controller) == (ratio, kind)), None)
 
 
 def _ends(problem: TuningProblem, threads: int | None) -> list[Gains]:

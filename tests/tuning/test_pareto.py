@@ -112,6 +112,7 @@ def test_the_fronts_are_written_as_data_and_picture(tmp_path: Path, capsys: pyte
     [
         (["--ratio", "0"], "ratio"),
         (["--ratio", "nan"], "ratio"),
+        (["p1-c0.5", "--ratio", "0.5"], "--ratio"),
         (["--ratio", "0.5", "--controller", "pd"], "no controller type"),
         (["--ratio", "0.5", "--controller", "pid", "--seed", "-1"], "seed"),
         (["--ratio", "0.5", "--write", "loop.yaml"], "one front"),
@@ -140,6 +141,24 @@ def test_bad_arguments_are_one_line(
     assert "tdof-npid pareto: " in last
     assert reason in last
     assert not list(tmp_path.iterdir())
+
+
+def test_any_case_has_its_fronts_and_a_point_of_one_is_a_file_for_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, point, folder = (str(tmp_path / name) for name in ("heater.yaml", "point.yaml", "fronts"))
+    facts = "--gain -0.8 --time-constant 18 --dead-time 2 --effort -100 100 --at 20 --step -4 --unit K"
+    assert main(["new", file, *facts.split()]) == 0
+    capsys.readouterr()
+    asked = ["pareto", file, "--controller", "tdof_npid2", "--generations", "3", "--out", folder, "--write", point]
+    assert main([*asked, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["points"]
+    assert {(row["case"], row["ratio"]) for row in rows} == {("heater", None)} and all(row["kp"] < 0 for row in rows)
+    best = min(rows, key=lambda row: row["iae_setpoint"] + row["iae_disturbance"])
+    assert main(["simulate", point, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["setpoint"]["iae"] == best["iae_setpoint"] and told["margins"]["m_s"] <= 2.0 + 1e-6
+    assert (tmp_path / "fronts/fronts.png").stat().st_size > 10_000
 
 
 def test_the_output_of_somebody_else_is_refused(tmp_path: Path) -> None:
