@@ -215,8 +215,9 @@ class Case:
 
     def _not_the_law_alone(self, who: str) -> GainsError:
         return GainsError(
-            f"{self.name}: {who} the law alone; take these out of the controller's parameters first: "
+            f"{self.name}: {who} the law alone, without "
             + ", ".join(name for name, value in self.options.as_dict().items() if value != PLAIN.as_dict()[name])
+            + ": let it have a copy of the file without these; gains that it finds go with this file, too (--gains)"
         )
 
     def setpoint_response(self, gains: Gains | None = None) -> SetpointMetrics:

@@ -198,7 +198,9 @@ OPTIONS: Final = table(
     Parameter("effort_rate", math.inf, "the effort moves no faster; inf: no limit", "effort per s", ABOVE_0),
     Parameter("dead_band", 0.0, "error that counts as none", "the output's unit", FROM_0),
     Parameter("filter_time", 0.0, "time constant of the output's first-order filter; 0: none", "s", FROM_0),
-    Parameter("angle", False, "true: setpoint and output are angles in rad, the error is the shorter way round"),
+    Parameter(
+        "angle", False, "true: setpoint and output are angles in rad, the error is the shorter way round", of_loop=True
+    ),
     Parameter("bumpless", True, "true: changes of gains and type do not move the effort at once"),
 )
 
@@ -390,8 +392,8 @@ PLANT: Final = table(
     Parameter("effort_min", -math.inf, "lower limit of the actuator", "the effort's unit", of_loop=True),
     Parameter("effort_max", math.inf, "upper limit of the actuator", "the effort's unit", of_loop=True),
     *NOISE.values(),
-    Parameter("output_unit", "", "unit of the output, for axes and tables", fixed=True),
-    Parameter("effort_unit", "", "unit of the effort, likewise", fixed=True),
+    Parameter("output_unit", "", "unit of the output, for axes and tables", fixed=True, of_loop=True),
+    Parameter("effort_unit", "", "unit of the effort, likewise", fixed=True, of_loop=True),
     Parameter(
         "start",
         math.inf,

@@ -102,6 +102,17 @@ def test_misspelt_parameters_are_warned_of(tmp_path: Path) -> None:
     assert printed.splitlines() == [f"tdof-npid: {each.message}" for each in warned]
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_belongs_to_the_loop_may_be_given_to_all_its_nodes(tmp_path: Path) -> None:
+    file = tmp_path / "servo.yaml"
+    text = (config_folder() / "p1-c4.yaml").read_text()
+    file.write_text(
+        text.replace("/**:\n  ros__parameters:\n", "/**:\n  ros__parameters:\n    angle: true\n    output_unit: rad\n")
+    )
+    case = load_case(file)
+    assert case.options.angle and case.units.output == "rad"
+
+
 def test_a_folder_does_not_hide_a_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
