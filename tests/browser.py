@@ -9,8 +9,7 @@ from typing import Any
 
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
            "--disable-component-update", "--disable-sync"]  # fmt: skip
-# On the live page: of each value of the effort, when its first sample was there, in ms since 1970.
-# Of each value of the effort, when it had been painted, in ms since 1970: two frames after its first sample came.
+# On the live page: of each value of the effort, when it had been painted, in ms since 1970, two frames after it came.
 WATCH_EFFORT = """
 (() => {
   window.seen = {}
