@@ -5,4 +5,4 @@ MODULES = (
     "reader", "realtime", "startup", "memory", "growth", "fleet", "live_page", "margins", "identification",
     "robust", "cluster",
 )  # fmt: skip
-LONG = ("seeds", "soak")  # not part of `make bench`: by name, with --only
+LONG = ("seeds", "forum", "soak")  # not part of `make bench`: by name, with --only

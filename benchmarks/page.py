@@ -66,8 +66,7 @@ def _head(results: Mapping[str, Result]) -> list[str]:
         "",
         "All of it again: `make bench` (under 40 minutes on two quiet cores) writes this page; "
         "`python -m benchmarks --only NAME` renews one section. `make bench-long` renews what takes too long for "
-        "that: seeds and "
-        "soak.",
+        "that: seeds, the plants from forums and the soak.",
         "",
         "## The machine",
         "",

@@ -31,6 +31,7 @@ SPREADS = {"gain": "20 %", "time_constant": "20 %", "zero_time_constant": "20 %"
 PLANTS = 50  # tuned for
 UNSEEN = 1_000
 GENERATIONS = 30  # from the nominal gains on
+SEEDS = (0, 1)  # of the search; the better on the plants tuned for counts
 
 
 class Compared(NamedTuple):
@@ -62,15 +63,18 @@ def compared(here: Workers, case_name: str, controller: ControllerType) -> Compa
     row = tuned(case_name, controller)
     assert row is not None
     nominal = case.gains.with_values(type=controller, **{name: getattr(row.gains, name) for name in PER_LANE})
-    problem = TuningProblem(
-        replace(case, gains=nominal), controller, generations=GENERATIONS, warm=True,
-        perturbed=Perturbed(spreads, PLANTS),
-    )  # fmt: skip
-    study = Study(problem)
-    study.run(Objective(problem))
-    if not study.feasible:
+    studies = []
+    for seed in SEEDS:
+        problem = TuningProblem(
+            replace(case, gains=nominal), controller, generations=GENERATIONS, warm=True, seed=seed,
+            perturbed=Perturbed(spreads, PLANTS),
+        )  # fmt: skip
+        studies.append(Study(problem))
+        studies[-1].run(Objective(problem))
+    allowed = [study for study in studies if study.feasible]
+    if not allowed:
         return None
-    both = (nominal, study.result.gains)
+    both = (nominal, min(allowed, key=lambda study: study.best_value).result.gains)
     return Compared(
         case_name, controller, *(sweep_plants(here, case, gains, spreads, count=UNSEEN, seed=1) for gains in both)
     )
