@@ -207,6 +207,17 @@ def _draw_curve(axes: Any, curve: Curve) -> None:
     axes.set_title(curve.name, fontsize=9)
     axes.set_xlabel(curve.size_unit, fontsize=8)
     axes.set_ylabel(curve.unit, fontsize=8)
+    for axis, values in ((axes.xaxis, curve.sizes), (axes.yaxis, [*curve.seconds, *linear])):
+        _few_plain_numbers(axis, max(values) / min(values))
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+
+
+def _few_plain_numbers(axis: Any, span: float) -> None:
+    """Label a logarithmic axis with 1, 2, 5 or, where it is long, with powers of ten alone."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if span < 200.0 else (1.0,)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _number(value)))
