@@ -22,21 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="parameter file that names the class of the bag's plant, for the comparison with the simulation",
     )
     add_choice(parser)
-    parser.add_argument("--png", type=Path, metavar="FILE", help="picture of setpoint, output and effort")
+    parser.add_argument(
+        "--plot", "--png", type=Path, metavar="FILE", help="picture of setpoint, output and effort"
+    )  # --png: as it was called first
     parser.add_argument("--html", type=Path, metavar="FILE", help="one page with interactive plots, for any browser")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="the table, numbers in full")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the metrics of every episode and write what was asked for."""
-    check_outputs([path for path in (arguments.png, arguments.html, arguments.csv) if path], _files(arguments.bags))
+    check_outputs([path for path in (arguments.plot, arguments.html, arguments.csv) if path], _files(arguments.bags))
     if arguments.case:
         load_case(arguments.case)  # from now on its class serves a bag whose plant bears its name
     report = analyze(arguments.bags, choice(arguments))
     written = []
-    if arguments.png:
-        report.picture(arguments.png)
-        written.append(arguments.png)
+    if arguments.plot:
+        report.picture(arguments.plot)
+        written.append(arguments.plot)
     if arguments.html:
         report.html(arguments.html)
         written.append(arguments.html)

@@ -55,7 +55,7 @@ UNSEEN = 10_000  # other plants, for which robust gains are verified
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this subcommand's arguments."""
     parser.add_argument("case", help="a case (p1-c0.5, …, sprott) or the path of a parameter file")
-    parser.add_argument("--controller", required=True, metavar="TYPE", help=", ".join(CONTROLLER_TYPES))
+    parser.add_argument("--controller", metavar="TYPE", help=f"{', '.join(CONTROLLER_TYPES)} (default: the case's)")
     seed, algorithm = TUNER["seed"].default, TUNER["algorithm"].default
     parser.add_argument("--seed", type=int, default=seed, help=f"the same seed gives the same result (default: {seed})")
     parser.add_argument("--free", choices=["sigma"], help="tune the width of k(e) too")
@@ -210,8 +210,8 @@ def _search_report(study: Study) -> dict[str, Any]:
 
 
 def _problem(arguments: argparse.Namespace) -> TuningProblem:
-    controller = controller_type(arguments.controller)
     case = load_case(arguments.case)
+    controller = controller_type(arguments.controller or case.gains.type)
     if arguments.weight is not None:
         case = replace(case, weight=arguments.weight)
     generations = GENERATIONS if arguments.generations is None else arguments.generations

@@ -49,7 +49,7 @@ COMMANDS = {  # what each writes, by its option
     "certify": ("{case}", {"--plot": "c.png", "--html": "c.html"}),
     "check": ("{case}", {}),
     "tune": ("{case} --controller pid --population 10 --generations 2", {"--out": "t.yaml", "--checkpoint": "t.json"}),
-    "analyze": ("{bag} {bag}", {"--png": "a.png", "--html": "a.html", "--csv": "a.csv"}),
+    "analyze": ("{bag} {bag}", {"--plot": "a.png", "--html": "a.html", "--csv": "a.csv"}),
     "verify": ("{bag} --case {case}", {}),
     "recover": ("{bag} {new}", {}),
     "new": ("{file} --gain 2 --time-constant 3 --step 1", {}),
