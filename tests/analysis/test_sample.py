@@ -67,6 +67,7 @@ def test_foxglove_shows_values_that_are_there(reader) -> None:
     for path in paths:
         topic, field, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d+|:)\]", path["value"]).groups()
         assert path["timestampMethod"] == "headerStamp"
+        assert path.get("showLine", True) == (index != ":")  # a line would go to and fro between the lanes
         assert len(values(reader, topic, field, 0 if index == ":" else int(index)))
         if topic == "/controller_state":
             assert set(reader.columns(topic, ["name"])["name"][:, int(index)]) == {path["label"]}
