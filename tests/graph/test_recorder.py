@@ -301,3 +301,20 @@ def test_a_killed_recorder_leaves_a_bag_that_can_be_verified(graph: Any, tmp_pat
     recorder.send(signal.SIGKILL)
     account = verify(tmp_path / "bag")
     assert account.different == 0 and account.equal + sum(account.unverifiable.values()) > 0
+
+
+def test_a_loop_that_waits_for_its_log_goes_on_with_the_next_recorder(graph: Any, tmp_path: Path) -> None:
+    from rosgraph_msgs.msg import Clock
+
+    graph.start("plant", case=CASE, lossless=True, reply_timeout=0.1)
+    graph.start("controller", case=CASE)
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"), lossless=True)
+    graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "3000 end"])
+    clock = graph.collect("/clock", Clock)
+    graph.wait_until(lambda: len(clock) > 3, 60.0, "steps")
+    recorder.send(signal.SIGKILL)
+    graph.wait_until(lambda: int(graph.fresh_fact("/plant", "held_up", 0)) > 3, what="the loop to wait")
+    graph.catch_up()
+    clock.clear()
+    graph.start("recorder", bag=str(tmp_path / "next"), lossless=True)
+    graph.wait_until(lambda: len(clock) > 3, 60.0, "steps")

@@ -136,6 +136,8 @@ class LockstepPlant:
                 node.warn_once("lossless: waiting for the recorder; start one with lossless in this namespace")
             if not self.held:
                 self._port.publish_output(episode.stamp_ns)
+            elif not is_new:
+                self._port.repeat_output()  # answered already; a recorder that was started again has heard nothing yet
             return
         if is_new:
             return

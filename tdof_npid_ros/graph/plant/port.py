@@ -65,6 +65,7 @@ class PlantPort:
         """
         node = self.node
         qos = node.promised_qos(with_deadline=with_deadline)
+        self._latest_output = b""
         self._output_publisher = node.publisher_of(JointState, "output", qos, matched=matched)
         self._episode_publisher = node.create_publisher(KeyValue, EPISODE, LATCHED_QOS)
         self._clock_publisher = node.create_publisher(Clock, "/clock", 10) if is_clock else None
@@ -94,9 +95,12 @@ class PlantPort:
     def publish_output(self, time_ns: int) -> None:
         """Publish what the plant puts out now, stamped with the loop's time."""
         simulator = self.simulator
-        self._output_publisher.publish(
-            self._output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
-        )
+        self._latest_output = self._output.write(time_ns, position=simulator.output, effort=simulator.applied_effort)
+        self._output_publisher.publish(self._latest_output)
+
+    def repeat_output(self) -> None:
+        """Publish the latest output again, as it was."""
+        self._output_publisher.publish(self._latest_output)
 
     def publish_clock(self, time_ns: int) -> None:
         """Publish the loop's time, if it is this plant that does."""
