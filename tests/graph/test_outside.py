@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import signal
 import subprocess
 import sys
@@ -102,6 +104,30 @@ def test_a_few_bytes_that_announce_many_messages_take_no_memory(graph: Any, coun
         status = Path(f"/proc/{process.process.pid}/status").read_text()
         (peak,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
         assert int(peak) < 1_000_000, (node, peak)  # kB
+
+
+# The middleware makes a request of a million bytes that are 0, and may take no more than 100 MB more.
+UNPACK = """
+import resource
+from rcl_interfaces.srv import SetParameters
+from rclpy.serialization import deserialize_message
+used_kb = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmData"))
+resource.setrlimit(resource.RLIMIT_DATA, (used_kb * 1024 + 100_000_000, -1))
+count = 1_000_000
+try:
+    deserialize_message(bytes((0, 1, 0, 0)) + count.to_bytes(4, "little") + bytes(count), SetParameters.Request)
+except RuntimeError:
+    print("dropped")
+"""
+
+
+def test_a_request_that_needs_more_memory_than_a_node_may_take_is_dropped(graph: Any) -> None:
+    controller = graph.start("controller")
+    graph.wait_for_nodes("/controller")
+    limit, _ = resource.prlimit(controller.process.pid, resource.RLIMIT_DATA)
+    assert limit == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    done = subprocess.run([sys.executable, "-c", UNPACK], capture_output=True, text=True, timeout=60)
+    assert "dropped" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("node", NODES)

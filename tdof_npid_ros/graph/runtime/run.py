@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import signal
 import socket
 import sys
@@ -47,6 +49,7 @@ def run_node(
     try:
         with _start_errors():
             use_fast_dds_profile()
+            take_half_of_the_memory_at_most()
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             node = make_node()
             if node.autostart:
@@ -72,6 +75,19 @@ def _program() -> str:
     """What the user has called: `controller`, `tdof-npid`."""
     name = sys.argv[0].rsplit("/", 1)[-1]
     return sys.argv[1] if name == "__main__.py" and len(sys.argv) > 1 else name
+
+
+def take_half_of_the_memory_at_most() -> None:
+    """Let what a peer sends cost a refused message, and not the machine.
+
+    The middleware makes room for a message before anybody can look at it, 250 bytes for each parameter in a request;
+    where it gets none, it drops the message and goes on. The limit is soft: who needs more may raise it, as `ulimit`
+    does, and a lower one that is set already stays.
+    """
+    half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if all(limit == resource.RLIM_INFINITY or limit > half for limit in (soft, hard)):
+        resource.setrlimit(resource.RLIMIT_DATA, (half, hard))
 
 
 class StartError(RuntimeError):
