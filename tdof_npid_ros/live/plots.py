@@ -53,7 +53,7 @@ class LivePlots:
         self._limits = (-math.inf, math.inf)
         output = new_plot(units.titled("output", "{output}"), 270, x_label="", name="output_plot")
         self._effort = effort = new_plot(units.titled("effort", "{effort}"), 190, x_label="", x_range=output.x_range)
-        terms = new_plot("P, I, D", 190, x_range=output.x_range)
+        terms = new_plot(units.titled("P, I, D", "{effort}"), 190, x_range=output.x_range)
         self._output, self._parts = output, terms
         output.y_range, effort.y_range, terms.y_range = (Range1d(-1.0, 1.0) for _ in range(3))
         after_step = new_plot("part of the step", 240, x_label="time since the step (s)")
