@@ -24,6 +24,7 @@ from foreign_bags import (
     state,
     write,
 )
+from loop_bags import EVENT, parameter_event
 
 from tdof_npid_ros.analysis import AnalysisError
 from tdof_npid_ros.analysis.compare import Recorded
@@ -470,6 +471,23 @@ def test_parameter_events_of_another_type_spoil_nothing(tmp_path) -> None:
     odd = [(0, "/parameter_events", FLOAT64, float64(1.0)), (0, "/scenario_plan", FLOAT64, float64(1.0))]
     told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
     assert is_the_step(by_joint(analyze([write(tmp_path / "bag", odd + told)]))["a"][0])
+
+
+def test_parameters_of_other_nodes_are_not_taken_for_ours(tmp_path) -> None:
+    """As `ros2 bag record -a` finds them on a robot: names that ours have, too, values of every type, a model."""
+    odd = {"p": 1.0, "kp": "1", "kd": [1.0, 2.0], "model": "os:system", "lanes": 7, "angle": True, "sample_period": 0.5}
+    told = measured({"a": STEP}) + setpoints([(0, {"a": 0}), (1, {"a": 1})])
+    with BagWriter(tmp_path / "bag") as writer:
+        events = writer.add_topic("/parameter_events", EVENT)
+        for node in ("/amcl", "/arm/driver", "/x"):
+            writer.write(events, parameter_event(node, odd) + bytes(3), START_NS, START_NS, 1)
+        topics = {topic: writer.add_topic(topic, type_name) for _, topic, type_name, _ in told}
+        for time_ns, topic, type_name, message in sorted(told, key=lambda one: one[0]):
+            data = bytes(STORE.serialize_cdr(message, type_name))
+            writer.write(topics[topic], data, START_NS + time_ns, START_NS + time_ns, 0)
+    report = analyze([tmp_path / "bag"])
+    (response,) = by_joint(report)["a"]
+    assert is_the_step(response) and report.episodes[0].episode.turn == (0.0,)
 
 
 # What is missing, and what comes late
