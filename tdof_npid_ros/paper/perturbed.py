@@ -2,7 +2,7 @@
 
 python -m tdof_npid_ros.paper.perturbed
 
-It prints the table of docs/robustness.md: every linear row of the paper, some five minutes on one core.
+It prints the table of docs/robustness.md: every linear row of the paper, some ten minutes on one core.
 """
 
 from __future__ import annotations
