@@ -11,7 +11,7 @@ import numpy as np
 from tdof_npid_ros.analysis.errors import AnalysisError
 from tdof_npid_ros.analysis.tracks import Layout, Track, layouts_of
 from tdof_npid_ros.bag.reader import BagReader
-from tdof_npid_ros.field_path import FieldPath, FieldPathError, Selection, Step
+from tdof_npid_ros.field_path import NAMES_OF_ELEMENTS, FieldPath, FieldPathError, Selection, Step
 from tdof_npid_ros.names import namespace_of
 from tdof_npid_ros.wire import JOINT_STATE, SECOND
 
@@ -190,12 +190,12 @@ def _from_columns(reader: BagReader, source: Source) -> Track | None:
     fields = reader.fields(source.topic)
     path = ".".join(step.field for step in steps)
     element = steps[-1].element
-    has_names = len(steps) == 1 and "name" in fields
+    names_at = _names_fields(fields, steps)
     through_arrays = any("[" in fields.get(".".join(s.field for s in steps[:i]), "") for i in range(1, len(steps)))
-    if path not in fields or through_arrays or (isinstance(element, str) and not has_names):
+    if path not in fields or through_arrays or len(names_at) > 1 or (isinstance(element, str) and not names_at):
         return None
     header = [name for name in ("header.stamp", "header.frame_id") if name in fields]
-    columns = reader.columns(source.topic, [path, *(["name"] if has_names else []), *header])
+    columns = reader.columns(source.topic, [path, *names_at, *header])
     values = columns[path]
     if values.dtype == object:
         if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in values):
@@ -204,9 +204,16 @@ def _from_columns(reader: BagReader, source: Source) -> Track | None:
         values = (values if values.ndim == 2 else values[:, None]).astype(np.float64, copy=False)
     else:
         return None
-    names = columns["name"] if has_names else np.empty((len(values), 0), "U1")
+    names = columns[names_at[0]] if names_at else np.empty((len(values), 0), "U1")
     track = _track(reader, source, columns, layouts_of(names, values))
     return track if element is None else _element(track, source.path, element)
+
+
+def _names_fields(fields: Mapping[str, str], steps: Sequence[Step]) -> list[str]:
+    """Fields that may name the elements of an array, beside it or in a message around it."""
+    around = ["".join(f"{step.field}." for step in steps[:depth]) for depth in range(len(steps))]
+    found = [prefix + field for prefix in around for field in NAMES_OF_ELEMENTS]
+    return [name for name in found if fields.get(name, "").startswith("string[")]
 
 
 def _element(track: Track, path: FieldPath, element: int | str) -> Track:

@@ -14,6 +14,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64 = "std_msgs/msg/Float64"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STATE = "control_msgs/msg/MultiDOFStateStamped"
+TRAJECTORY_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+COMMAND = "control_msgs/msg/MultiDOFCommand"
 START_NS = 1_700_000_000_000_000_000
 H_NS = 10_000_000
 TAU = 0.2  # s: a joint follows its setpoint by 1 - exp(-t/TAU)
@@ -27,6 +29,11 @@ STORE.register(
     )
 )
 STORE.register(get_types_from_msg("std_msgs/Header header\ncontrol_msgs/SingleDOFState[] dof_states", STATE))
+STORE.register(get_types_from_msg("string[] dof_names\nfloat64[] values\nfloat64[] values_dot", COMMAND))
+_POINTS = "".join(
+    f"\ntrajectory_msgs/JointTrajectoryPoint {name}" for name in ("reference", "feedback", "error", "output")
+)
+STORE.register(get_types_from_msg(f"std_msgs/Header header\nstring[] joint_names{_POINTS}", TRAJECTORY_STATE))
 
 Message = tuple[int, str, str, Any]  # receive time in ns from the start on, topic, type, message
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_bags import (
+    COMMAND,
     FLOAT64,
     FLOAT64_ARRAY,
     H_NS,
@@ -15,9 +16,11 @@ from foreign_bags import (
     STATE,
     STORE,
     TAU,
+    TRAJECTORY_STATE,
     float64,
     floats,
     follows,
+    header,
     joints,
     measured,
     setpoints,
@@ -36,6 +39,8 @@ from tdof_npid_ros.cli import main
 from tdof_npid_ros.metrics import SetpointMetrics
 from tdof_npid_ros.responses import Response
 
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+DURATION = STORE.types["builtin_interfaces/msg/Duration"]
 STEP = follows(0.0, [(1.0, 1.0)])
 STANDS = follows(5.0, [])
 SETTLES_S = 0.6  # 1 - exp(-t/0.2) is within 5 % from 0.599 s on
@@ -380,6 +385,35 @@ def test_the_state_of_a_pid_controller_holds_the_whole_loop(tmp_path) -> None:
     assert is_the_step(found["a"][0]) and found["b"][0].iae == 0.0
     assert [use.peak for use in report.episodes[0].effort] == [0.5, 0.1]
     assert "taken as output /pid_controller/controller_state:dof_states.feedback" in report.table()
+
+
+def test_the_state_of_a_trajectory_controller_names_its_joints(tmp_path) -> None:
+    """Its names lie beside the messages that hold the values, and change places."""
+    point = lambda values: STORE.types[POINT](np.array(values, np.float64), *[np.zeros(0)] * 3, DURATION(0, 0))  # noqa: E731
+    bag = []
+    for t in range(0, 5 * 10**9, H_NS):
+        loop = {"a": (float(t >= 10**9), STEP(t / 1e9)), "b": (5.0, 5.0)}
+        names = sorted(loop, reverse=t // H_NS % 2 == 1)
+        reference, feedback = (point([loop[name][i] for name in names]) for i in range(2))
+        state = STORE.types[TRAJECTORY_STATE](header(START_NS + t), names, reference, feedback, point([]), point([]))
+        bag.append((t, "/jtc/controller_state", TRAJECTORY_STATE, state))
+    found = by_joint(analyze([write(tmp_path / "bag", bag)]))
+    assert list(found) == ["a", "b"]
+    assert is_the_step(found["a"][0]) and found["b"][0].iae == 0.0
+
+
+def test_a_command_to_many_goes_by_its_names(tmp_path) -> None:
+    told = [
+        (
+            round(t * 1e9) - 1000,
+            "/reference",
+            COMMAND,
+            STORE.types[COMMAND](["b", "a"], np.array([5.0, r]), np.zeros(0)),
+        )
+        for t, r in ((0, 0.0), (1, 1.0))
+    ]
+    found = by_joint(analyze([write(tmp_path / "bag", measured({"a": STEP, "b": STANDS}) + told)]))
+    assert is_the_step(found["a"][0]) and found["b"][0].iae == 0.0
 
 
 def test_a_controller_in_a_namespace_beside_the_robot_s_joint_states(tmp_path) -> None:
