@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tdof_npid_ros.cli.experiment import add_experiment_arguments, at_rest, proposal_of, recorded, told
+from tdof_npid_ros.cli.experiment import add_experiment_arguments, at_rest, longest_of, proposal_of, recorded, told
 from tdof_npid_ros.cli.loop_client import observed
 from tdof_npid_ros.commissioning.confirm import Confirmed, confirmed, settling_time
 from tdof_npid_ros.commissioning.design import SET, Design, check_relay, designed, identified
@@ -140,8 +140,9 @@ def _experiment(
         return False
     work.proposals.append(text)
     work.noise = work.noise or rest.noise
-    excitation = proposal.excitation(rest.noise, arguments.hold)
-    with Hold(loop, "commission", proposal.safe_output, proposal.safe_effort, arguments.duration) as hold:
+    longest_level, longest = longest_of(loop, arguments)
+    excitation = proposal.excitation(rest.noise, longest_level)
+    with Hold(loop, "commission", proposal.safe_output, proposal.safe_effort, longest) as hold:
         hold.follow(excitation, proposal.by, rest.output)
     work.records.append(record_of(hold.taken, f"experiment {number + 1}", len(work.records) + 1, loop.effort_limits))
     return True
@@ -157,7 +158,8 @@ def _trial(
     wanted = argparse.Namespace(**{**vars(arguments), "by": "setpoint", "size": None})
     base = rest.output if loop.options.manual else rest.setpoint
     proposal = proposal_of(loop, rest._replace(setpoint=base), wanted, "step")
-    with Hold(loop, "confirm", proposal.safe_output, proposal.safe_effort, arguments.duration) as hold:
+    _, longest = longest_of(loop, arguments)
+    with Hold(loop, "confirm", proposal.safe_output, proposal.safe_effort, longest) as hold:
         hold.apply({**design.settings, "manual": False, "experiment_setpoint": base})
         hold.wait(SETTLES * design.horizon)
         before = hold.taken[-REST_SAMPLES:]

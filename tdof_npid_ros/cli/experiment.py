@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tdof_npid_ros.graph.observer import LoopObserver, NodeState
 
 RECORDER_PATIENCE = 30.0  # s
+HOLD, DURATION = (600.0, 3000), (3600.0, 18_000)  # of a level, of an experiment at the most: s, or so many samples
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,10 +48,9 @@ def add_experiment_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=("LOW", "HIGH"),
             help=f"all is restored at once when the {what} {text} this range (default: the controller's safe_range)",
         )
-    parser.add_argument("--hold", type=float, default=600.0, metavar="S", help="of a level at the most (default: 600)")
-    parser.add_argument(
-        "--duration", type=float, default=3600.0, metavar="S", help="of the experiment at the most (default: 3600)"
-    )
+    for what, limit, of in (("hold", HOLD, "a level"), ("duration", DURATION, "the experiment")):
+        told = f"of {of} at the most (default: {limit[0]:g}, or {limit[1]} samples where that is longer)"
+        parser.add_argument(f"--{what}", type=float, metavar="S", help=told)
     parser.add_argument("--patience", type=float, default=30.0, metavar="S", help="to wait for rest (default: 30)")
     parser.add_argument("--bag", type=Path, metavar="DIR", help="record to this new folder (default: bags/<date>)")
 
@@ -66,8 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
         proposal = proposal_of(loop, rest, arguments, arguments.kind)
         if not arguments.json:
             print(told(proposal, rest), flush=True)
-        excitation = proposal.excitation(rest.noise, arguments.hold)
-        with Hold(loop, "experiment", proposal.safe_output, proposal.safe_effort, arguments.duration) as hold:
+        longest_level, longest = longest_of(loop, arguments)
+        excitation = proposal.excitation(rest.noise, longest_level)
+        with Hold(loop, "experiment", proposal.safe_output, proposal.safe_effort, longest) as hold:
             hold.follow(excitation, proposal.by, rest.output)
         record = record_of(hold.taken, "experiment", 1, loop.effort_limits)
     stretch = record.stretch
@@ -93,6 +94,14 @@ def run(arguments: argparse.Namespace) -> int:
 def at_rest(loop: LoopAtWork, arguments: argparse.Namespace) -> Rest:
     """The loop at rest, waited for."""
     return loop.rest(0.01 * loop.scale, arguments.patience)
+
+
+def longest_of(loop: LoopAtWork, arguments: argparse.Namespace) -> tuple[float, float]:
+    """How long a level and the experiment may last, s: as given, else as a loop with this sample period needs."""
+    period = float(loop.values["sample_period"])
+    limits = (arguments.hold, HOLD), (arguments.duration, DURATION)
+    level, whole = (max(s, n * period) if given is None else float(given) for given, (s, n) in limits)
+    return level, whole
 
 
 def proposal_of(loop: LoopAtWork, rest: Rest, arguments: argparse.Namespace, kind: Any, times: float = 1.0) -> Proposal:
