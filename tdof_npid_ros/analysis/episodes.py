@@ -133,7 +133,13 @@ def episodes_in(reader: BagReader, path: str | Path, chosen: Chosen = NOTHING_CH
         AnalysisError: there is no output in it, or none of two samples.
         BagError: it is damaged.
     """
-    found = [episode for loop in observed_loops(reader, str(path), chosen) for episode in _episodes(loop)]
+    loops = observed_loops(reader, str(path), chosen)
+    if not loops:
+        raise AnalysisError(
+            f"{path}: the output's messages hold no values: choose another field with --output TOPIC:FIELD, as "
+            "/joint_states:velocity"
+        )
+    found = [episode for loop in loops for episode in _episodes(loop)]
     if not found:
         raise AnalysisError(f"{path}: no episode of at least two outputs in it: record longer")
     return sorted(found, key=lambda episode: episode.start_ns)

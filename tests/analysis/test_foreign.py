@@ -387,6 +387,17 @@ def test_the_state_of_a_pid_controller_holds_the_whole_loop(tmp_path) -> None:
     assert "taken as output /pid_controller/controller_state:dof_states.feedback" in report.table()
 
 
+def test_where_positions_are_empty_another_field_is_asked_for(tmp_path) -> None:
+    bag = [
+        (t, "/joint_states", JOINT_STATE, joints({"a": STEP(t / 1e9)}, START_NS + t, "velocity"))
+        for t in range(0, 5 * 10**9, H_NS)
+    ]
+    with pytest.raises(AnalysisError, match="hold no values: choose another field with --output"):
+        analyze([write(tmp_path / "bag", bag)])
+    chosen = Chosen.read("/joint_states:velocity", None, None)
+    assert list(by_joint(analyze([tmp_path / "bag"], chosen))) == ["a"]
+
+
 def test_the_state_of_a_trajectory_controller_names_its_joints(tmp_path) -> None:
     """Its names lie beside the messages that hold the values, and change places."""
     point = lambda values: STORE.types[POINT](np.array(values, np.float64), *[np.zeros(0)] * 3, DURATION(0, 0))  # noqa: E731
