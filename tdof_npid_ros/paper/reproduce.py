@@ -34,6 +34,7 @@ from tdof_npid_ros.paper.evaluation import (
 )
 from tdof_npid_ros.paper.findings import findings
 from tdof_npid_ros.paper.items import ITEMS, Evaluated
+from tdof_npid_ros.paper.nominal_robust import nominal_beside_robust
 from tdof_npid_ros.paper.output import claim_folder, kept_until_written
 from tdof_npid_ros.paper.pages import Section, html_page, markdown_page, markdown_table
 from tdof_npid_ros.paper.report import Figure, Finding, Table
@@ -246,7 +247,12 @@ class Reproduction:
             yield Section("What reproduces", (at_a_glance(self.rows),))
             yield Section(
                 "The paper's conclusions on our numbers",
-                (against_pid(self.rows), against_published(self.rows), price_of_robustness(self.rows)),
+                (
+                    against_pid(self.rows),
+                    against_published(self.rows),
+                    price_of_robustness(self.rows),
+                    nominal_beside_robust(self.rows),
+                ),
             )
             yield Section("What does not reproduce, and why", self.findings)
         for title, names in SECTIONS.items():

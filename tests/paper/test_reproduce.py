@@ -18,6 +18,7 @@ from tdof_npid_ros.paper.conclusions import TOLERANCES
 from tdof_npid_ros.paper.evaluation import deviation_percent, measure, optimum, paper_case, published_gains, searches_of
 from tdof_npid_ros.paper.inferred import OPTIMAL, as_stated, inferred, optimality
 from tdof_npid_ros.paper.items import ITEMS, SETTLED_AT, variation_metrics
+from tdof_npid_ros.paper.nominal_robust import nominal_beside_robust
 from tdof_npid_ros.paper.output import MARKER, OutputError, claim_folder
 from tdof_npid_ros.paper.pages import Section, html_page
 from tdof_npid_ros.paper.report import Figure, Table, shown_cell
@@ -295,3 +296,11 @@ def test_the_search_bounds_hold_the_printed_gains(case: str) -> None:
     for row in (row for row in ROWS if row.case == case):
         for name, (lower, upper) in paper_case(case).bounds.items():
             assert name == "sigma" or lower <= getattr(row, name) <= upper
+
+
+def test_robust_gains_are_better_on_unseen_plants_on_every_linear_row() -> None:
+    rows = {(row.case, row.controller): None for row in ROWS}
+    table = nominal_beside_robust(rows)  # type: ignore[arg-type]
+    assert len(table.rows) == sum(row.case != "sprott" for row in ROWS) == 18
+    for _, _, unstable, mean, _, robust_unstable, robust_mean, _ in table.rows:
+        assert (robust_unstable, robust_mean) < (unstable, mean)  # type: ignore[operator]
