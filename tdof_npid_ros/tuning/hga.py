@@ -10,11 +10,17 @@ bounds by the fraction 1 - r^((1 - t/T)^shape): anywhere at first, hardly at all
 
 That finds the valley of a good controller in a generation or two and then creeps along it. So by default the HGA
 explores briefly and *polishes* (`quadratic.py`): of all points seen it keeps the best few, fits a quadratic to them,
-and asks for the model's minimum and for samples about it, shaped like the cloud of kept points. When that has
-stalled, the round is over, and another begins from a new random population, dense at the bounds, and polishes more
-patiently, until the budget is spent. A round whose points agree already, but in a valley that lies higher than the best
-is given up. After a round that has found a better best, the next one begins about it, near and far: a narrow valley is
-walked in more than one round. Every candidate counts as an evaluation. `polish=0` is the paper's HGA alone.
+and asks for the model's minimum and for samples about it, shaped like the cloud of kept points, and for one farther
+on, beyond the best point as seen from the cloud's centre. When that has stalled, the round is over, and another begins
+from a new random population, dense at the bounds, and polishes more patiently, until the budget is spent. A round whose
+points agree already, but in a valley that lies higher than the best is given up. After a round that has found a better
+best, the next one begins about it, near and far. Every candidate counts as an evaluation. `polish=0` is the paper's HGA
+alone.
+
+As long as no other round has ended as low as the best, its valley may go on, too narrow and bent for a quadratic: where
+a round about the best has found a better one, or a round from anywhere has not, the next one is a *walk* (`walk.py`)
+from the best, one for each best. Once another has ended as low, rounds look elsewhere: what lies about the ends of all
+rounds before is not taken for good.
 
 Half of each random population is drawn along the parameters' scales, half of it linearly: bounds that fit lie about
 the gains, bounds that are decades wide do not.
@@ -46,6 +52,7 @@ from numpy.typing import ArrayLike
 from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.ask_tell import Array, Optimizer, Scores, SearchState
 from tdof_npid_ros.tuning.quadratic import coefficients, model_step
+from tdof_npid_ros.tuning.walk import Walk
 
 MIN_EXPLORATION = 2
 """Generations of HGA before each polish, at least: the random population and its offspring."""
@@ -62,11 +69,26 @@ RADII, GROUP = (1.0, 2.0, 4.0, 0.5), 8
 SAMPLE_SPREAD = 0.6
 """Standard deviation of the samples, in those of the kept points; well below 1, so that the cloud shrinks."""
 
+ONWARD = 3.0
+"""How far, at most, a sample goes on beyond the best point, in distances of that from the kept points' centre."""
+
+KNOWN = 0.1
+"""How far from where another round ended a round that looks elsewhere keeps away, in any parameter, of its range."""
+
+OUT_OF_QUESTION = 1e6
+"""The violation of a point there."""
+
 PENALTY_CAP = 3.0
 """Merits above best + 3 (median - best) of the kept points count as that much: a penalty must not bend the model."""
 
 PROGRESS, PATIENCE = 1e-4, 3.0
 """A polish has stalled when PATIENCE times the kept points were told without improving by PROGRESS, relatively."""
+
+PATIENCE_OF_WALK = 6.0
+"""As PATIENCE, of a walk, which gets worse at first."""
+
+LONGEST = 0.5
+"""Of the budget, which a round that creeps may take, before another sees with more points; a walk may take longer."""
 
 HIGHER = 4.0
 """A round is given up when its best point lies higher than the run's by so many times median - best of its points."""
@@ -91,19 +113,25 @@ class HGAState(SearchState):
     Attributes:
         round: restarts so far.
         about_best: whether this round began about the best of those before.
+        elsewhere: whether it keeps away from where rounds before it ended.
         round_began_at: the best value when this round began.
-        age: generations told in this round.
+        age: generations told in this round; `began_after`: evaluations before it.
         searching: whether nothing allowed has been found yet.
         points, objectives, violations: [m, d] in 0 .. 1, [m], [m]: the best points of this round, best merit first.
         goal: the merit below which this round counts as having made progress; `waited`: evaluations since.
         penalty: of the merit in this round.
         ends: the lowest allowed values of the rounds that began anywhere and are over; infinite where there is none.
+        walk: of this round, if it is one.
+        walked_from: the best value when the last walk was over.
+        end_points: [k, d] in 0 .. 1, where those of them ended that ended at something allowed.
     """
 
     round: int = 0
     about_best: bool = False
+    elsewhere: bool = False
     round_began_at: float = math.inf
     age: int = 0
+    began_after: int = 0
     searching: bool = True
     points: Array = field(default_factory=lambda: np.empty((0, 0)))
     objectives: Array = field(default_factory=lambda: np.empty(0))
@@ -112,11 +140,14 @@ class HGAState(SearchState):
     waited: int = 0
     penalty: float = PENALTY
     ends: Array = field(default_factory=lambda: np.empty(0))
+    end_points: Array = field(default_factory=lambda: np.empty((0, 0)))
+    walk: Walk | None = None
+    walked_from: float = math.inf
 
 
-_COUNTS = ("evaluations", "generation", "round", "age", "waited")
-_NUMBERS = ("best_value", "best_violation", "round_began_at", "goal", "penalty")
-_FLAGS = ("about_best", "searching")
+_COUNTS = ("evaluations", "generation", "round", "age", "began_after", "waited")
+_NUMBERS = ("best_value", "best_violation", "round_began_at", "goal", "penalty", "walked_from")
+_FLAGS = ("about_best", "elsewhere", "searching")
 
 
 class HGA(Optimizer):
@@ -165,40 +196,71 @@ class HGA(Optimizer):
         self.eta, self.mutation_rate, self.shape = eta, mutation_rate, shape
         self._random = np.random.Generator(np.random.PCG64(seed))
         uniform = self._random.random((population, self.dimension))
-        self._state = HGAState(self._with_starts(self._half_linear(uniform)))
+        self._state = HGAState(self._with_starts(self._half_linear(uniform)), end_points=np.empty((0, self.dimension)))
         self._forget()
 
     @property
     def converged(self) -> bool:
         """Whether `ROUNDS_TO_CONVERGE` rounds are over, and `CONFIRMATIONS` begun anywhere ended as low as the best."""
-        ends = self._state.ends
-        as_low = int(np.count_nonzero(ends <= self.best_value + CONFIRMED * abs(self.best_value)))
-        return self.best_violation == 0.0 and self._state.round >= ROUNDS_TO_CONVERGE and as_low >= CONFIRMATIONS
+        return self._confirmed and self._state.round >= ROUNDS_TO_CONVERGE
+
+    @property
+    def _confirmed(self) -> bool:
+        """Whether `CONFIRMATIONS` rounds begun anywhere ended as low as the best."""
+        as_low = self._state.ends <= self.best_value + CONFIRMED * abs(self.best_value)
+        return self.best_violation == 0.0 and int(np.count_nonzero(as_low)) >= CONFIRMATIONS
 
     def _new_round(self) -> Array:
         """End the round, forget all but the global best, and draw the next one's population.
 
-        About the best if the round has found it, at all distances. Otherwise anywhere, densely at the bounds: a valley
-        that lies along one is often narrow, and a uniform population misses it.
+        About the best if the round has found it, at all distances. Otherwise, if it is no walk, anywhere, densely at
+        the bounds: a valley that lies along one is often narrow, and a uniform population misses it.
         """
         state = self._state
         if state.violations[0] > 0.0:
             state.penalty *= STIFFER
-        if not state.about_best:
-            lowest = state.objectives[state.violations == 0.0].min(initial=math.inf)
-            state.ends = np.append(state.ends, lowest)
-        state.about_best = state.best_violation == 0.0 and state.best_value < state.round_began_at - PROGRESS * abs(
-            state.best_value
-        )
+        was_about_best, confirmed = state.about_best, self._confirmed
+        if not was_about_best:
+            self._note_end()
+            confirmed = self._confirmed
+        allowed = state.best_violation == 0.0
+        better = allowed and state.best_value < state.round_began_at - PROGRESS * abs(state.best_value)
+        if state.walk:
+            state.walked_from = state.best_value
+        walks = allowed and better == was_about_best and not confirmed and state.best_value < state.walked_from
+        state.about_best = better or walks
+        state.elsewhere = confirmed and not state.about_best
         state.round_began_at = state.best_value
         state.round += 1
         self._forget()
+        state.walk = Walk.begun_at(state.best) if walks and state.best is not None else None
+        if state.walk:
+            return state.walk.samples(self._random, self.polish)
         uniform: Array = self._random.random((self.population, self.dimension))
         if state.about_best and state.best is not None:
             reach = self._random.random((self.population, 1))
             about: Array = np.clip(state.best + reach * reach * reach * (2.0 * uniform - 1.0), 0.0, 1.0)
             return about
         return self._half_linear(uniform * uniform * (3.0 - 2.0 * uniform))
+
+    def _note_end(self) -> None:
+        """Where the round, begun anywhere, has ended, and how low."""
+        state = self._state
+        allowed = np.flatnonzero(state.violations == 0.0)
+        lowest = math.inf
+        if allowed.size:
+            end = allowed[np.argmin(state.objectives[allowed])]
+            lowest = float(state.objectives[end])
+            state.end_points = np.concatenate([state.end_points, state.points[end : end + 1]])
+        state.ends = np.append(state.ends, lowest)
+
+    def _away(self, told: Scores) -> Scores:
+        """The scores as this round takes them: elsewhere, what is near a known end is not allowed."""
+        state = self._state
+        if not state.elsewhere:
+            return told
+        distances = np.abs(state.candidates[:, None] - state.end_points[None]).max(axis=2).min(axis=1)
+        return Scores(told.objective, told.violation + np.where(distances < KNOWN, OUT_OF_QUESTION, 0.0))
 
     def _half_linear(self, points: Array) -> Array:
         """The points [n, d] in 0 .. 1, every other one of them along linear scales."""
@@ -209,6 +271,7 @@ class HGA(Optimizer):
     def _forget(self) -> None:
         state = self._state
         state.age = state.waited = 0
+        state.began_after = state.evaluations
         state.points = np.empty((0, self.dimension))
         state.objectives, state.violations = np.empty(0), np.empty(0)
         state.goal = math.inf
@@ -231,16 +294,21 @@ class HGA(Optimizer):
         state.age += 1
         if state.searching and state.best_violation == 0.0:
             state.searching, state.goal, state.waited = False, math.inf, 0
+        told = self._away(told)
         if self.polish:
             self._keep_best(told)
-        if state.age < self._exploration:
+        if state.walk:
+            state.walk = state.walk.moved(state.candidates[np.lexsort((told.objective, told.violation))])
+        elif state.age < self._exploration:
             return self._mutated(self._reproduced(told))
         if self._stalled(told.objective.size):
             return self._new_round()
-        return self._polished()
+        return state.walk.samples(self._random, self.polish) if state.walk else self._polished()
 
     def _merits(self, objective: Array, violation: Array) -> Array:
         """What points are kept and fitted by, [m]."""
+        if self._state.walk:
+            return Scores(objective, violation).values
         if self._state.searching:
             return violation + TIE * objective / (1.0 + np.abs(objective))
         return objective + self._state.penalty * violation * np.abs(objective)
@@ -281,7 +349,10 @@ class HGA(Optimizer):
             state.goal, state.waited = best - PROGRESS * abs(best), 0
         else:
             state.waited += told
-        return state.waited > PATIENCE * self._kept or self._is_higher()
+        if state.walk:
+            return state.waited > PATIENCE_OF_WALK * self._kept
+        too_long = state.evaluations - state.began_after > LONGEST * self.budget
+        return too_long or state.waited > PATIENCE * self._kept or self._is_higher()
 
     def _is_higher(self) -> bool:
         """Whether the round's points are in a valley that lies higher than the best of the run."""
@@ -304,10 +375,14 @@ class HGA(Optimizer):
         """The model's minimum within the group's radius and samples about it and about the best point."""
         centre, cloud = model_step(points, values, RADII[group % len(RADII)] * TRUST_RADIUS)
         deviation[0] = 0.0
+        onward = ONWARD * self._random.random() * (points[0] - points.sum(axis=0) / len(points))
         about = np.where(np.arange(len(deviation))[:, None] % 2 == 0, centre, points[0])
         spread = (cloud[None, :, :] * deviation[:, None, :]).sum(axis=2)
-        samples: Array = np.clip(about + SAMPLE_SPREAD * spread, 0.0, 1.0)
-        return samples
+        samples = about + SAMPLE_SPREAD * spread
+        if len(samples) > 1:
+            samples[-1] = points[0] + onward
+        clipped: Array = np.clip(samples, 0.0, 1.0)
+        return clipped
 
     def state(self) -> dict[str, Any]:
         """All that the run is, as JSON can hold it exactly; `from_state` goes on from it bit for bit."""
@@ -344,6 +419,8 @@ _ARGUMENTS = ("seed", "population", "generations", "eta", "mutation_rate", "shap
 
 def _encoded(value: Any) -> Any:
     """A part of the state as JSON holds it: infinity, which JSON does not know, is None."""
+    if isinstance(value, Walk):
+        value = value.numbers()
     if isinstance(value, np.ndarray):
         return [_encoded(one) for one in value.tolist()] if value.ndim == 1 else value.tolist()
     return None if value == math.inf else value
@@ -366,6 +443,8 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
         candidates=_unit(state["candidates"], dimension),
         best=best,
         points=points,
+        end_points=_unit(state["end_points"], dimension),
+        walk=Walk.of_numbers(_finite(state["walk"] or []), dimension),
         **{name: state[name] for name in _FLAGS},
         ends=np.append(np.empty(0), [math.inf if one is None else float(_finite([one])[0]) for one in state["ends"]]),
         objectives=objectives,

@@ -36,8 +36,8 @@ def model_step(points: Array, values: Array, radius: float) -> tuple[Array, Arra
     dimension = points.shape[1]
     offsets = points - points.sum(axis=0) / len(points)
     covariance = (offsets[:, :, None] * offsets[:, None, :]).sum(axis=0) / len(points)
-    shape = _regularised_cholesky(covariance)
-    whitened = _forward(shape, np.ascontiguousarray((points - points[0]).T)).T
+    shape = regularised_cholesky(covariance)
+    whitened = forward(shape, np.ascontiguousarray((points - points[0]).T)).T
     gradient, hessian = _fit(whitened, values)
     step = _trust_region_step(gradient, hessian, radius)
     centre = points[0].copy()
@@ -53,8 +53,8 @@ def _fit(points: Array, values: Array) -> tuple[Array, Array]:
     terms = np.column_stack([np.ones(count), points, points[:, rows] * points[:, columns]])
     weighted = terms / np.sqrt(1.0 + np.arange(count))[:, None]
     normal = (weighted[:, :, None] * terms[:, None, :]).sum(axis=0)
-    factor = _regularised_cholesky(normal)
-    coefficients = _backward(factor, _forward(factor, (weighted * (values - values[0])[:, None]).sum(axis=0)))
+    factor = regularised_cholesky(normal)
+    coefficients = _backward(factor, forward(factor, (weighted * (values - values[0])[:, None]).sum(axis=0)))
     hessian = np.zeros((dimension, dimension))
     hessian[rows, columns] = coefficients[1 + dimension :]
     return coefficients[1 : 1 + dimension], hessian + hessian.T
@@ -68,13 +68,14 @@ def _trust_region_step(gradient: Array, hessian: Array, radius: float) -> Array:
     while True:
         factor = _cholesky(hessian + multiplier * identity)
         if factor is not None:
-            step = -_backward(factor, _forward(factor, gradient))
+            step = -_backward(factor, forward(factor, gradient))
             if float((step * step).sum()) <= radius * radius:
                 return step
         multiplier = max(2.0 * multiplier, unit)
 
 
-def _regularised_cholesky(matrix: Array) -> Array:
+def regularised_cholesky(matrix: Array) -> Array:
+    """Lower factor of a symmetric matrix [n, n], with as little added to its diagonal as makes it positive definite."""
     ridge = RIDGE
     diagonal = np.diag(matrix) + 1e-300
     while True:
@@ -106,7 +107,7 @@ def _factorise(rest: Array, lower: Array) -> bool:
     return True
 
 
-def _forward(lower: Array, right: Array) -> Array:
+def forward(lower: Array, right: Array) -> Array:
     """Solve L x = right, right [n] or [n, k]."""
     x = right.reshape(len(right), -1).copy()
     _substitute_forward(lower, x)

@@ -130,6 +130,32 @@ def test_it_finds_the_end_of_a_kinked_valley() -> None:
         assert hga.best_value <= 1.001
 
 
+def bent_border(x: Array) -> Scores:
+    """Allowed is what lies within 0.01 of a bent line, steep on both sides; the best is at one end of it."""
+    off = np.abs(x[:, 1:] - 0.5 * x[:, :1] ** 2).max(axis=1)
+    return Scores(1.0 + (x[:, 0] - 2.0) ** 2 + 20.0 * off, np.maximum(off - 0.01, 0.0))
+
+
+def test_it_walks_to_the_end_of_what_a_narrow_border_allows() -> None:
+    for seed in range(3):
+        hga = HGA([-3.0] * 3, [3.0] * 3, seed=seed)
+        while not hga.done:
+            hga.tell(bent_border(hga.ask()))
+        assert hga.best_violation == 0.0
+        assert hga.best_value <= 1.001
+
+
+def test_once_a_valley_is_sure_rounds_look_elsewhere() -> None:
+    hga = cube(3)
+    while not hga.state()["elsewhere"]:
+        hga.tell(1.0 + sphere(hga.ask()))
+    ends = np.array(hga.state()["end_points"])
+    run(hga, lambda x: 1.0 + sphere(x), 30)
+    kept = np.array(hga.state()["points"])[:10]
+    assert hga.state()["elsewhere"]
+    assert (np.abs(kept[:, None] - ends[None]).max(axis=2) >= 0.1).all()
+
+
 def test_without_the_polish_it_is_the_papers_algorithm() -> None:
     hga = cube(3, polish=0, generations=60)
     asked = run(hga, sphere)
@@ -286,6 +312,10 @@ DAMAGE = {
     "objectives": [1.0, float("nan")],
     "searching": 3,
     "about_best": None,
+    "elsewhere": 0,
+    "end_points": [[0.5, 1.5]],
+    "walk": [0.01, 0.5],
+    "walked_from": "low",
     "round_began_at": "low",
     "violations": [0.0],
     "penalty": "much",
