@@ -52,7 +52,8 @@ def price_of_robustness(rows: Rows) -> Table:
     for level in LEVELS:
         columns += [f"objective, M_s ≤ {level:g} (s)", f"Δ M_s ≤ {level:g} (%)"]
     note = (
-        "All tuned by our HGA, one run of 4,000 evaluations each; TDOF-NPID2 has the gains of TDOF-NPID1 where these "
+        "All tuned by our HGA, the best of two runs of 4,000 evaluations each; TDOF-NPID2 has the gains of TDOF-NPID1 "
+        "where these "
         "are better. Δ: against the free objective. M_s: largest magnitude of the sensitivity of the linearised loop "
         "(the circuit's is linearised at the setpoint 1)."
     )

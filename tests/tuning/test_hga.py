@@ -145,6 +145,24 @@ def test_it_walks_to_the_end_of_what_a_narrow_border_allows() -> None:
         assert hga.best_value <= 1.001
 
 
+@pytest.mark.parametrize("kind", ["walk", "elsewhere"])
+def test_a_run_resumed_amid_a_walk_or_elsewhere_ends_as_the_one_left_alone(kind: str) -> None:
+    def told(hga: HGA) -> Scores:
+        return bent_border(hga.ask()) if kind == "walk" else Scores.allowed(1.0 + sphere(hga.ask()))
+
+    alone = HGA([-3.0] * 3, [3.0] * 3, seed=2)
+    while not alone.state()[kind]:
+        alone.tell(told(alone))
+    for _ in range(7):
+        alone.tell(told(alone))
+    assert alone.state()[kind]
+    resumed = HGA.from_state(json.loads(json.dumps(alone.state(), allow_nan=False)))
+    for _ in range(300):
+        alone.tell(told(alone))
+        resumed.tell(told(resumed))
+    assert resumed.state() == alone.state()
+
+
 def test_once_a_valley_is_sure_rounds_look_elsewhere() -> None:
     hga = cube(3)
     while not hga.state()["elsewhere"]:
