@@ -59,7 +59,8 @@ def test_the_example_of_a_plant_of_one_s_own_runs(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = Path(__file__).parents[2] / "docs" / "your-own-plant.md"
-    code, parameters = re.findall(r"```(?:python|yaml)\n(.*?)```", page.read_text(), re.DOTALL)
+    after = page.read_text().partition("# my_plants/pendulum.py")[2]
+    code, parameters = re.fullmatch(r"\n(.*?)```.*?```yaml\n(.*?)```.*", after, re.DOTALL).groups()  # type: ignore[union-attr]
     (tmp_path / "my_plants").mkdir()
     (tmp_path / "my_plants" / "pendulum.py").write_text(code)
     file = tmp_path / "pendulum.yaml"

@@ -10,6 +10,7 @@ import signal
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -49,7 +50,8 @@ def main() -> None:
     rclpy.init()
     robot = PlainRobot()
     signal.signal(signal.SIGUSR1, robot.weaken)
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+    # RCLError: told to end amid a spin
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException, rclpy_implementation.RCLError):
         rclpy.spin(robot)
 
 

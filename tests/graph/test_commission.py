@@ -180,6 +180,7 @@ def test_somebodys_node_is_commissioned(graph: Any, tmp_path: Path) -> None:
     assert graph.get_parameters("/loop/controller", *PLAIN) == [report["gains"][name] for name in PLAIN]
 
 
+@pytest.mark.skipif(not ALL, reason="a long form: TDOF_COMMISSION=all")
 def test_a_step_worse_than_predicted_brings_back_the_gains_of_before(graph: Any, tmp_path: Path) -> None:
     robot = driven_robot(graph)
     tool, log = commission(graph, tmp_path), tmp_path / "tool.log"

@@ -67,9 +67,10 @@ def test_the_page_sees_and_steers_the_loop(program: Program) -> None:
         opened(page, program.url)
         assert model(page, "kp_field", "w.value") == load_case("p1-c0.5").gains.kp
 
-        model(page, "setpoint_field", "w.value = 1.0")
         numbers = lambda: str(model(page, "numbers", "w.text"))  # noqa: E731
         said = lambda: numbers() + str(model(page, "nodes", "w.text"))  # noqa: E731
+        eventually(lambda: "controller</b> running" in said(), said)  # a step is one from what was there before
+        model(page, "setpoint_field", "w.value = 1.0")
         eventually(lambda: "overshoot" in numbers() and "M_s 2.3" in numbers(), said)
 
         model(page, "kp_field", "w.value = 5.0")

@@ -45,7 +45,7 @@ def test_a_study_spends_its_budget_and_no_more() -> None:
 def test_from_python_the_case_s_margins_hold_too_and_others_in_their_place() -> None:
     asked = replace(CASE, search={"ms": 1.5, "free": "sigma"})
     for given, limit in (({}, 1.5), ({"ms": 1.3}, 1.3)):
-        result = tune(asked, "tdof_npid1", population=10, generations=20, **given)
+        result = tune(asked, "tdof_npid1", population=20, generations=60, **given)
         m_s = margins(asked, result.gains).m_s
         assert m_s is not None and m_s <= limit + 1e-6
         assert result.gains.sigma != CASE.gains.sigma
