@@ -314,7 +314,7 @@ class ColumnBuilder:
         self.size += 16 * table.length.size
         if self._sequence is not None:
             self._sequence.append(table.sequence.astype(np.int64))
-        for size in np.unique(table.length):
+        for size in scan.distinct(table.length):
             which = table.length == size
             least = HEAD_BYTES + self._definition.least[self._definition.root]
             if size < least:

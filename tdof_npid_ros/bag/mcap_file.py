@@ -135,7 +135,7 @@ class McapFile:
         """
         where = self._where_is(span)
         table = self._records_of(span)
-        unknown = set(np.unique(table.channel).tolist()) - self._channels.keys()
+        unknown = set(scan.distinct(table.channel).tolist()) - self._channels.keys()
         if unknown:
             raise BagError(f"{where}: messages of channel {min(unknown)}, which is not announced: {DAMAGED}")
         if table.log_time.size and not (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -12,6 +12,7 @@ from tdof_npid_ros.compiled import compiled, entry_point
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
+_Number = TypeVar("_Number", bound=np.integer)
 
 _MESSAGE: Final = int(Opcode.MESSAGE)
 _PREFIX_BYTES: Final = 9
@@ -24,6 +25,13 @@ WRONG_LENGTH: Final = 2  # a message record too short for its own fields
 WRONG_TIME: Final = 3  # a time beyond 2**63 - 1 ns
 OTHER_RECORD: Final = 4  # no message (only `run_length` stops there)
 TOO_MANY: Final = 5  # records that are no messages
+
+
+def distinct(values: NDArray[_Number]) -> NDArray[_Number]:
+    """The values, each once: mostly they are all one, which is seen sooner than sorted."""
+    if values.size and (values == values[0]).all():
+        return values[:1]
+    return np.unique(values)
 
 
 @compiled
