@@ -607,13 +607,18 @@ def misspelt(given: Iterable[str], known: Table) -> list[str]:
     return unknown_parameters(given, known, {*of_loop, *OF_ROS, PLAN.name})
 
 
+LARGEST_NS: Final = 2**53  # 104 days: up to here a float can tell one nanosecond from the next
+
+
 def sample_period_in_ns(value: Any) -> int:
     """A sample period in s as a whole number of nanoseconds.
 
     Raises:
-        ParameterError: not a number of seconds above 0, or no whole number of nanoseconds.
+        ParameterError: not a number of seconds above 0, too large, or no whole number of nanoseconds.
     """
     period: float = SAMPLE_PERIOD.checked(value)
+    if period * 1e9 > LARGEST_NS:
+        raise ParameterError(f"sample_period is {period!r} s: it must be at most {LARGEST_NS / 1e9:.4g} s")
     period_ns = round(period * 1e9)
     if period_ns < 1 or abs(period_ns - period * 1e9) > 1e-3:
         raise ParameterError(f"sample_period is {period!r} s: it must be a whole number of nanoseconds")
