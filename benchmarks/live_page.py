@@ -8,17 +8,16 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from benchmarks.harness import Result, Verdict, main, processor_seconds, resident_mib, ros_environment, summary
+from benchmarks.realtime import running_loop
 from tdof_npid_ros.graph.conductor import Conductor
-from tdof_npid_ros.graph.processes import NodeProcesses
-from tests.browser import WATCH_EFFORT, chromium_page
+from tests.browser import WATCH_EFFORT, chromium_page, seen_efforts
+from tests.scripted_loop import ScriptedLoop
 
 TITLE = "The live page"
 METHOD = (
@@ -52,7 +51,7 @@ def run(size: str) -> Result:
         Verdict("the same, the latest, ms", seen[-1], None),
     ]
     alone, beside, processor, memory = 0, 0, [], []
-    with _loop() as conductor:
+    with running_loop(NAMESPACE, PERIOD) as conductor:
         for _ in range(rounds):
             alone += _missed(conductor, window)
             with _page(NAMESPACE) as (program, _):
@@ -77,65 +76,18 @@ def _quantile(ordered: list[float], q: float) -> float:
 
 def _steps_seen(steps: int) -> list[float]:
     """Of each step, how long until the page held it, in ms, in order."""
-    import rclpy
-    from sensor_msgs.msg import JointState
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("loop", namespace=SCRIPTED, context=context)
-    publishers = {topic: node.create_publisher(JointState, topic, 10) for topic in ("output", "control_effort")}
-    published: dict[float, float] = {}
-
-    def hold(value: float, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            message = JointState()
-            message.header.stamp = node.get_clock().now().to_msg()
-            message.position, message.effort = [value], [value]
-            publishers["output"].publish(message)
-            published.setdefault(value, time.time())
-            publishers["control_effort"].publish(message)
-            time.sleep(PERIOD)
-
-    def seen() -> dict[float, float]:
-        return {float(value): at / 1000.0 for value, at in page.evaluate("Object.entries(window.seen)")}
-
-    try:
-        with _page(SCRIPTED) as (_, page):
-            page.evaluate(WATCH_EFFORT)
-            end = time.monotonic() + TIMEOUT
-            while not seen():
-                if time.monotonic() > end:
-                    raise TimeoutError("the page does not show the loop")
-                hold(0.0, HELD)
-            for step in range(steps):
-                hold(1.0 + step, HELD)
-            hold(0.5, 1.0)  # for what is on its way
-            at = seen()
-            return sorted(1000.0 * (at[1.0 + step] - published[1.0 + step]) for step in range(steps))
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
-
-
-@contextmanager
-def _loop() -> Iterator[Conductor]:
-    """Plant and controller in realtime, as processes of their own."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "bench.yaml"
-        file.write_text(
-            f"/**: {{ros__parameters: {{sample_period: {PERIOD}, mode: realtime}}}}\n"
-            "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, sigma: 1.0, setpoint: 1.0}}\n"
-        )
-        with NodeProcesses(file, NAMESPACE) as nodes:
-            conductor = Conductor(NAMESPACE, nodes.check)
-            try:
-                nodes.start("controller")
-                nodes.start("plant")
-                conductor.wait(lambda: conductor.fact("plant", "output_to_effort_p50_us") != "", "the loop", TIMEOUT)
-                yield conductor
-            finally:
-                conductor.close()
+    with ScriptedLoop(SCRIPTED, PERIOD) as loop, _page(SCRIPTED) as (_, page):
+        page.evaluate(WATCH_EFFORT)
+        end = time.monotonic() + TIMEOUT
+        while not seen_efforts(page):
+            if time.monotonic() > end:
+                raise TimeoutError("the page does not show the loop")
+            loop.hold(0.0, HELD)
+        for step in range(steps):
+            loop.hold(1.0 + step, HELD)
+        loop.hold(0.5, 1.0)  # for what is on its way
+        at = seen_efforts(page)
+        return sorted(1000.0 * (at[1.0 + step] - loop.published[1.0 + step]) for step in range(steps))
 
 
 def _missed(conductor: Conductor, seconds: float) -> int:

@@ -126,25 +126,32 @@ class IdlePlant:
 
 
 @contextmanager
-def idle_plant(period: float) -> Iterator[IdlePlant]:
-    """A plant with this sample period and its controller, as processes of their own."""
+def running_loop(namespace: str, period: float) -> Iterator[Conductor]:
+    """A plant in realtime with this sample period and its controller, as processes of their own that have met."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "bench.yaml"
         file.write_text(
             f"/**: {{ros__parameters: {{sample_period: {period}, mode: realtime}}}}\n"
             "/**/controller: {ros__parameters: {kp: 2.0, ki: 1.0, sigma: 1.0, setpoint: 1.0}}\n"
         )
-        with NodeProcesses(file, NAMESPACE) as nodes:
-            conductor = Conductor(NAMESPACE, nodes.check)
+        with NodeProcesses(file, namespace) as nodes:
+            conductor = Conductor(namespace, nodes.check)
             try:
                 nodes.start("controller")
                 nodes.start("plant")
                 conductor.wait(lambda: conductor.fact("plant", "output_to_effort_p50_us") != "", "the loop", TIMEOUT)
-                plant = IdlePlant(conductor)
-                plant.stop()
-                yield plant
+                yield conductor
             finally:
                 conductor.close()
+
+
+@contextmanager
+def idle_plant(period: float) -> Iterator[IdlePlant]:
+    """The plant of a loop with this sample period, inactive."""
+    with running_loop(NAMESPACE, period) as conductor:
+        plant = IdlePlant(conductor)
+        plant.stop()
+        yield plant
 
 
 if __name__ == "__main__":

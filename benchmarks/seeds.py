@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import Result, Table, Verdict, main
+from benchmarks.harness import Result, Table, Verdict, main, one_process_per_core
 from benchmarks.tuning import Row, free_at_published, published_rows
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.paper.tables import published
@@ -61,7 +58,7 @@ def run(size: str) -> Result:
     problems += [Problem(row, free_at_published(row)) for row in rows if free_at_published(row)]
     work = [(problem, "de", 0, DE_POPULATION, DE_GENERATIONS // tenth) for problem in problems]
     work += [(problem, "hga", seed, 40, 200 // tenth) for problem in problems for seed in seeds]
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
+    with one_process_per_core() as pool:
         values = list(pool.map(_objective, work))
     found: dict[tuple[Problem, str], list[float]] = {}
     for (problem, algorithm, *_), value in zip(work, values, strict=True):

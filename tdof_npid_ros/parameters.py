@@ -46,7 +46,7 @@ SAMPLE_PERIOD: Final = Parameter(
     0.01,
     "time of one step, between two outputs; a whole number of nanoseconds; the same for all nodes of a loop",
     "s",
-    ABOVE_0_FINITE,
+    Range(0.0, 2**53 / 1e9, closed_low=False, words="above 0, at most 104 days"),  # beyond, a float cannot tell 1 ns
     fixed=True,
     of_loop=True,
 )
@@ -607,18 +607,13 @@ def misspelt(given: Iterable[str], known: Table) -> list[str]:
     return unknown_parameters(given, known, {*of_loop, *OF_ROS, PLAN.name})
 
 
-LARGEST_NS: Final = 2**53  # 104 days: up to here a float can tell one nanosecond from the next
-
-
 def sample_period_in_ns(value: Any) -> int:
     """A sample period in s as a whole number of nanoseconds.
 
     Raises:
-        ParameterError: not a number of seconds above 0, too large, or no whole number of nanoseconds.
+        ParameterError: out of the parameter's range, or no whole number of nanoseconds.
     """
     period: float = SAMPLE_PERIOD.checked(value)
-    if period * 1e9 > LARGEST_NS:
-        raise ParameterError(f"sample_period is {period!r} s: it must be at most {LARGEST_NS / 1e9:.4g} s")
     period_ns = round(period * 1e9)
     if period_ns < 1 or abs(period_ns - period * 1e9) > 1e-3:
         raise ParameterError(f"sample_period is {period!r} s: it must be a whole number of nanoseconds")

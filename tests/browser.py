@@ -25,6 +25,11 @@ WATCH_EFFORT = """
 """
 
 
+def seen_efforts(page: Any) -> dict[float, float]:
+    """What WATCH_EFFORT has noted: when each value had been painted, in s since 1970."""
+    return {float(value): at / 1000.0 for value, at in page.evaluate("Object.entries(window.seen)")}
+
+
 @contextmanager
 def chromium_page(program: str, width: int = 1280, height: int = 900, **context: Any) -> Iterator[Any]:
     """A Playwright page; at its end, errors in its console and requests beyond this machine fail the test."""

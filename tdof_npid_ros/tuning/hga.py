@@ -219,10 +219,10 @@ class HGA(Optimizer):
         state = self._state
         if state.violations[0] > 0.0:
             state.penalty *= STIFFER
-        was_about_best, confirmed = state.about_best, self._confirmed
+        was_about_best = state.about_best
         if not was_about_best:
             self._note_end()
-            confirmed = self._confirmed
+        confirmed = self._confirmed
         allowed = state.best_violation == 0.0
         better = allowed and state.best_value < state.round_began_at - PROGRESS * abs(state.best_value)
         if state.walk:

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdof_npid_ros.compiled import entry_point
-from tdof_npid_ros.control.exponential import exp_minus
+from tdof_npid_ros.control.law import exp_minus_of
 from tdof_npid_ros.tuning.quadratic import Array, forward, regularised_cholesky
 
 FIRST_STEP = 0.01
@@ -112,9 +111,4 @@ class Walk:
 
 
 def _exponential(x: float) -> float:
-    return _exp_minus(-x) if x < 0.0 else 1.0 / _exp_minus(x)
-
-
-@entry_point
-def _exp_minus(q: float) -> float:
-    return exp_minus(q)
+    return exp_minus_of(-x) if x < 0.0 else 1.0 / exp_minus_of(x)

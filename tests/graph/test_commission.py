@@ -48,6 +48,15 @@ def started(graph: Any, loop: Loop) -> None:
     graph.wait_for_nodes("/loop/plant", "/loop/controller")
 
 
+def commission(graph: Any, folder: Path, *arguments: str, **how: Any) -> subprocess.Popen[str]:
+    """The tool as a process; what it says is in `tool.log`, where `how` gives it no other streams."""
+    with (folder / "tool.log").open("w") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag", *arguments],
+            env=graph.environment, cwd=folder, text=True, **{"stdout": log, "stderr": log, **how},
+        )  # fmt: skip
+
+
 def ranges(loop: Loop) -> dict[str, tuple[float, float]]:
     return {"output": loop.safe, "effort": loop.effort}
 
@@ -90,11 +99,8 @@ def test_gains_are_near_the_best_with_the_margin_and_the_loop_stays_safe(graph: 
     loop = LOOPS[name]
     outputs = graph.collect("/loop/output", JointState)
     started(graph, loop)
-    tool = subprocess.Popen(
-        [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--json", "--bag", "bag",
-         "--out", "plant.yaml", "--ms", str(MS), *loop.more],
-        env=graph.environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    asked = ["--json", "--out", "plant.yaml", "--ms", str(MS), *loop.more]
+    tool = commission(graph, tmp_path, *asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     graph.wait_until(lambda: tool.poll() is not None, 500.0, "the tool's end")
     told, errors = tool.communicate()
     assert tool.returncode == 0, told[-1000:] + errors
@@ -131,11 +137,8 @@ def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path, moment: st
     """Also in what a script starts in the background, where a shell has SIGINT ignored."""
     loop = LOOPS["level by hand"]
     started(graph, loop)
-    tool = subprocess.Popen(
-        [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag"],
-        env=graph.environment, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
-    )  # fmt: skip
+    ignored = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)  # noqa: E731
+    tool = commission(graph, tmp_path, stderr=subprocess.PIPE, preexec_fn=ignored)
     graph.wait_until(lambda: tool.poll() is not None or MOMENTS[moment](graph, loop), 60.0, f"the {moment}")
     tool.send_signal(signal.SIGINT)
     graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
@@ -155,15 +158,6 @@ def driven_robot(graph: Any) -> Any:
     graph.start("controller", namespace="/loop", type="tdof_npid2", setpoint=1.0, sample_period=0.01, **PLAIN)
     graph.wait_for_nodes("/loop/controller")
     return robot
-
-
-def commission(graph: Any, folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    """The tool as a process; what it says is in `tool.log`."""
-    with (folder / "tool.log").open("w") as log:
-        return subprocess.Popen(
-            [sys.executable, "-m", "tdof_npid_ros", "commission", "/loop", "--yes", "--bag", "bag", *arguments],
-            env=graph.environment, cwd=folder, stdout=log, stderr=log, text=True,
-        )  # fmt: skip
 
 
 def test_somebodys_node_is_commissioned(graph: Any, tmp_path: Path) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 
 import pytest
-from browser import WATCH_EFFORT, chromium_page
+from browser import WATCH_EFFORT, chromium_page, seen_efforts
 from live_program import CHROMIUM, Program, eventually, needs_chromium
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.alone]
@@ -20,49 +19,30 @@ PERIOD_S = 0.01
 
 @needs_chromium
 def test_a_step_is_shown_within_200_ms(tmp_path: Path) -> None:
-    rclpy = pytest.importorskip("rclpy")
-    from sensor_msgs.msg import JointState
+    pytest.importorskip("rclpy")
+    from scripted_loop import ScriptedLoop
 
     program = Program(tmp_path, "--join", "/fast")
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(program.environment["ROS_DOMAIN_ID"]))
-    node = rclpy.create_node("loop", namespace="/fast", context=context)
-    publishers = {topic: node.create_publisher(JointState, topic, 10) for topic in ("output", "control_effort")}
-    published = {0.0: 0.0}
-
-    def run(seconds: float, value: float) -> None:
-        """Publish outputs with their answers, the effort's value among them."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            message = JointState()
-            message.header.stamp = node.get_clock().now().to_msg()
-            message.position, message.effort = [value], [value]
-            publishers["output"].publish(message)
-            published.setdefault(value, time.time())
-            publishers["control_effort"].publish(message)
-            time.sleep(PERIOD_S)
-
     try:
         assert CHROMIUM
-        with chromium_page(CHROMIUM) as page:
+        domain = int(program.environment["ROS_DOMAIN_ID"])
+        with ScriptedLoop("/fast", PERIOD_S, domain) as loop, chromium_page(CHROMIUM) as page:
             page.goto(program.url, timeout=60_000)
             page.wait_for_function("window.Bokeh && Bokeh.documents[0]?.is_idle", timeout=60_000)
             page.evaluate(WATCH_EFFORT)
-            eventually(lambda: run(0.1, 0.0) or page.evaluate("0 in window.seen"), "the loop is seen")
+            eventually(lambda: loop.hold(0.0, 0.1) or 0.0 in seen_efforts(page), "the loop is seen")
             late: list[list[float]] = []
             for number in range(ROUNDS):
                 values = [1.0 + STEPS * number + k for k in range(STEPS)]
                 for value in values:
-                    run(0.1, value)
-                run(1.0, 0.5)  # for what is on its way
-                seen = {float(value): at / 1000 for value, at in page.evaluate("Object.entries(window.seen)")}
-                late.append(sorted(seen.get(value, math.inf) - published[value] for value in values))
+                    loop.hold(value, 0.1)
+                loop.hold(0.5, 1.0)  # for what is on its way
+                seen = seen_efforts(page)
+                late.append(sorted(seen.get(value, math.inf) - loop.published[value] for value in values))
                 if late[-1][-1 - MOST_LATE] <= LATEST_S:
                     break
         told = [f"median {1000 * one[STEPS // 2]:.0f} ms, at most {1000 * one[-1]:.0f} ms" for one in late]
         print(*told, sep="\n")
         assert late[-1][-1 - MOST_LATE] <= LATEST_S, told
     finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
         program.stop()
