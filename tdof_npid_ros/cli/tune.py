@@ -47,7 +47,7 @@ from tdof_npid_ros.tuning.perturbed import Perturbed
 from tdof_npid_ros.tuning.price import price_of_ms
 from tdof_npid_ros.tuning.problem import GENERATIONS, POLISH, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study, TuningResult
-from tdof_npid_ros.workers import WorkersError, workers
+from tdof_npid_ros.workers import Workers, WorkersError, workers
 
 UNSEEN = 10_000  # other plants, for which robust gains are verified
 
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--until-converged",
         action="store_true",
-        help="end before the budget is spent, once two restarts of the search have ended no better",
+        help="end before the budget is spent, once two rounds begun anywhere have ended within 0.1 %% of the best",
     )
     parser.add_argument("--cold", action="store_true", help="do not begin with the case's own gains")
     add_constraint_arguments(parser)
@@ -129,27 +129,24 @@ def run(arguments: argparse.Namespace) -> int:
         warnings.warn(f"{reason}, so no loop comes to rest in it and none is asked to", stacklevel=2)
     study = Study(problem, arguments.checkpoint, arguments.resume)
     started = time.monotonic()
-    with (
-        workers(arguments.scheduler) as where,
-        _interrupt_requested() as interrupted,
-        _progress(study, shown=not arguments.json) as show,
-    ):
+    with workers(arguments.scheduler) as where:
         objective = Objective(problem, where=where if arguments.scheduler else None)
         try:
-            study.run(objective, lambda study: show(study) or not interrupted())
+            with _interrupt_requested() as interrupted, _progress(study, shown=not arguments.json) as show:
+                study.run(objective, lambda study: show(study) or not interrupted())
+            if not study.done:
+                _say_interrupted(study, arguments)
+                return INTERRUPTED
+            study.require_feasible()
+            unseen = _unseen(problem, study.result.gains, where)
         except WorkersError as error:
             raise WorkersError(f"{error}, {_how_to_go_on(arguments)}") from None
-    if not study.done:
-        _say_interrupted(study, arguments)
-        return INTERRUPTED
-    study.require_feasible()
     result = study.result
     found = margins(problem.case, result.gains)
     report = response_report(problem.case, result.gains)
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
     report |= _search_report(study) | {"margins": found.as_dict(), "price": _price(problem, result, found)}
     report |= advised(problem.case, result.gains)
-    unseen = _unseen(problem, result.gains, arguments.scheduler)
     if unseen is not None:
         report |= {"robust": _robust_report(problem, result.objective, unseen)}
     if arguments.out:
@@ -162,13 +159,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _unseen(problem: TuningProblem, gains: Gains, scheduler: str | None) -> RobustResult | None:
+def _unseen(problem: TuningProblem, gains: Gains, where: Workers) -> RobustResult | None:
     """What the gains achieve on other plants of the spreads than they were tuned for."""
     if problem.perturbed is None:
         return None
-    with workers(scheduler) as where:
-        seed = problem.perturbed.seed + 1
-        return sweep_plants(where, problem.case, gains, problem.perturbed.spreads, count=UNSEEN, seed=seed)
+    seed = problem.perturbed.seed + 1
+    return sweep_plants(where, problem.case, gains, problem.perturbed.spreads, count=UNSEEN, seed=seed)
 
 
 def _robust_report(problem: TuningProblem, objective: float, unseen: RobustResult) -> dict[str, Any]:

@@ -134,11 +134,17 @@ class Screens:
         self._sample_period = plants[0].sample_period
         self._responses = [_response(plant) for plant in plants]
 
-    def __call__(self, gains: Gains, modes: bool = True) -> LaneMargins:
-        """The margins, (lanes * plants,): first of the first lane with all plants, and so on; else as `Screen`."""
+    def __call__(self, gains: Gains, modes: bool = True, plants: slice = slice(None)) -> LaneMargins:
+        """The margins, (lanes * plants,): first of the first lane with all plants, and so on; else as `Screen`.
+
+        Args:
+            gains, modes: as for `Screen`.
+            plants: which; by default all.
+        """
         c = coefficients(gains, self._sample_period)
-        found = np.empty((len(self._responses), _RESULTS, gains.lanes))
-        for response, of_plant in zip(self._responses, found, strict=True):
+        responses = self._responses[plants]
+        found = np.empty((len(responses), _RESULTS, gains.lanes))
+        for response, of_plant in zip(responses, found, strict=True):
             _screen_lanes(response, c[KP], c[KI_H], c[KD_H], c[PHI], modes, of_plant)
         by_lane = np.ascontiguousarray(found.transpose(1, 2, 0)).reshape(_RESULTS, -1)
         return _lane_margins(by_lane, self._sample_period)

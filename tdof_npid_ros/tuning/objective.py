@@ -20,6 +20,9 @@ from tdof_npid_ros.workers import Workers, available_cores
 LARGEST_IAE = 1e30
 """unit·s: an IAE above it is compressed; such a loop is useless, and only its place in the order matters."""
 
+CHUNKS_PER_CORE = 4
+"""Of candidates with many plants: their loops and margins do not all take the same time."""
+
 _DOUBLINGS = 1024.0  # of LARGEST_IAE within the range of a float: a compressed IAE stays below 2·LARGEST_IAE
 _DIVERGED = 3.0  # penalty / LARGEST_IAE of a lane that diverged at once; it falls to 2 for one that nearly did not
 
@@ -37,13 +40,10 @@ def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float)
 
 
 def scores(problem: TuningProblem, candidates: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
-    """The scores of candidates (n, len(problem.names)) from the integrals of their episodes, (n,) each.
-
-    With perturbed plants the integrals are (n * plants,): first those of the first candidate with all plants.
-    """
+    """The scores of candidates (n, len(problem.names)) with the case's plant, from the integrals of their episodes,
+    (n,) each."""
     gains = gains_from_candidates(problem.base, problem.names, candidates)
-    judge = problem.plants_judge if problem.perturbed else problem.judge
-    return judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
+    return problem.judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
 
 
 def _cost(integrals: Integrals) -> Array:
@@ -82,12 +82,12 @@ class Objective:
         Raises:
             GainsError: a candidate is not a valid set of gains.
         """
+        if self._problem.perturbed:
+            return self._scores_with_plants(candidates)
         return scores(self._problem, candidates, *self.integrals(candidates))
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
-        """Of the setpoint and the disturbance episode, (n,) each; (n * plants,) with perturbed plants."""
-        if self._problem.perturbed:
-            return self._integrals_of_plants(candidates)
+        """Of the setpoint and the disturbance episode with the case's plant, (n,) each."""
         problem = self._problem
         blocks = [
             gains_from_candidates(problem.base, problem.names, candidates[block])
@@ -97,23 +97,29 @@ class Objective:
         setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance
 
-    def _integrals_of_plants(self, candidates: Array) -> tuple[Integrals, Integrals]:
-        problem, cores = self._problem, self._where.cores if self._where else self._threads
-        parts = np.array_split(candidates, min(cores, len(candidates)))
-        chunks = [(episode, part) for episode in EPISODES for part in parts]
+    def _scores_with_plants(self, candidates: Array) -> Scores:
+        problem = self._problem
+        judge = problem.plants_judge  # made here, before threads ask for it
+        cores = self._where.cores if self._where else self._threads
+        chunks = [(candidates, plants) for plants in judge.chunks(len(candidates), CHUNKS_PER_CORE * cores)]
         if self._where:
-            found = self._where.map(integrals_of_plants, problem, chunks)
+            parts = self._where.map(scores_with_plants, problem, chunks)
         else:
-            _ = problem.plants  # before threads ask for them
-            found = list(self._pool.map(integrals_of_plants, [problem] * len(chunks), chunks))
-        return joined(found[: len(parts)]), joined(found[len(parts) :])
+            _ = problem.plants
+            parts = list(self._pool.map(scores_with_plants, [problem] * len(chunks), chunks))
+        return judge.together(gains_from_candidates(problem.base, problem.names, candidates), parts)
 
 
-def integrals_of_plants(problem: TuningProblem, chunk: tuple[str, Array]) -> Integrals:
-    """Of an episode with candidates (n, len(problem.names)), each with all perturbed plants, (n * plants,)."""
-    episode, candidates = chunk
+def scores_with_plants(problem: TuningProblem, chunk: tuple[Array, slice]) -> Scores:
+    """Of candidates with each of some plants, (candidates * plants,): first the first candidate with all of them."""
+    candidates, plants = chunk
     gains = gains_from_candidates(problem.base, problem.names, candidates)
-    return problem.case.integrals(episode, gains, problem.plants[episode].with_each_of(len(candidates)))
+    setpoint, disturbance = (
+        problem.case.integrals(episode, gains, problem.plants[episode][plants].with_each_of(gains.lanes))
+        for episode in EPISODES
+    )
+    objective = objective_values(setpoint, disturbance, problem.weight)
+    return problem.plants_judge(gains, plants, objective, setpoint, disturbance)
 
 
 def _blocks(lanes: int, threads: int) -> list[slice]:

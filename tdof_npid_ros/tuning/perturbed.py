@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from tdof_npid_ros.tuning.judge import UNSTABLE, Judge
 
 MOST_PLANTS = 100_000
 MOST_SPREADS = 6  # whose corners are watched: 64
+LEAST_LOOPS = 1024  # that are worth a chunk of their own
 
 
 @dataclass(frozen=True)
@@ -107,22 +109,37 @@ class PlantsJudge:
             corners = perturbed.corners(case)
             self._corners = Screens(linear_loop_plants(case, corners)) if corners else None
 
-    def __call__(self, gains: Gains, objective: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
-        """The scores (n,) of candidates.
+    def chunks(self, candidates: int, wanted: int) -> list[slice]:
+        """The plants in about so many parts, fewer if these were small; no score depends on it."""
+        plants = self._perturbed.plants
+        parts = min(wanted, plants, -(-candidates * plants // LEAST_LOOPS))
+        ends = np.linspace(0, plants, parts + 1).astype(int).tolist()
+        return [slice(first, last) for first, last in itertools.pairwise(ends)]
+
+    def __call__(
+        self, gains: Gains, plants: slice, objective: Array, setpoint: Integrals, disturbance: Integrals
+    ) -> Scores:
+        """Of candidates with each of some plants, (n * plants,): first the first candidate with all of them.
 
         Args:
-            gains: theirs, n lanes.
-            objective: (10), (n * plants,): first that of the first candidate with all plants.
+            gains: the candidates', n lanes.
+            plants: which they are.
+            objective: (10), (n * plants,).
             setpoint, disturbance: of the episodes, likewise.
         """
-        candidates, plants = gains.lanes, self._perturbed.plants
-        margins = self._screens(gains) if self._screens else None
-        ki = np.repeat(gains.per_lane("ki"), plants)
-        scores = self._judge.scores(ki, margins, objective, setpoint, disturbance)
-        value = self._perturbed.together(scores.objective.reshape(candidates, plants).T)
-        violations = scores.violation.reshape(candidates, plants)
+        margins = self._screens(gains, plants=plants) if self._screens else None
+        ki = np.repeat(gains.per_lane("ki"), len(objective) // gains.lanes)
+        return self._judge.scores(ki, margins, objective, setpoint, disturbance)
+
+    def together(self, gains: Gains, parts: Sequence[Scores]) -> Scores:
+        """The scores (n,) of candidates from those with the plants of each chunk."""
+        objective, violation = (
+            np.hstack([values.reshape(gains.lanes, -1) for values in each])
+            for each in zip(*((part.objective, part.violation) for part in parts), strict=True)
+        )
+        value = self._perturbed.together(np.ascontiguousarray(objective.T))
         if self._corners:
-            stable = self._corners(gains, modes=False).stable.reshape(candidates, -1)
-            violations = np.hstack([violations, np.where(stable, 0.0, UNSTABLE)])
+            stable = self._corners(gains, modes=False).stable.reshape(gains.lanes, -1)
+            violation = np.hstack([violation, np.where(stable, 0.0, UNSTABLE)])
         # Beside the worst, how many there are: a search must see whether it gets nearer.
-        return Scores(value, violations.max(axis=1) + np.mean(violations > 0.0, axis=1))
+        return Scores(value, violation.max(axis=1) + np.mean(violation > 0.0, axis=1))

@@ -59,7 +59,19 @@ def test_a_score_is_put_together_from_those_of_each_plant_alone(by: str | float)
     np.testing.assert_allclose(found.objective, put_together, rtol=1e-14)
     allowed = np.max([scores.violation for scores in alone], axis=0) == 0.0
     assert np.all(allowed[found.violation == 0.0])
-    np.testing.assert_array_equal(found.objective, Objective(together, threads=1)(candidates).objective)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+def test_scores_do_not_depend_on_how_the_work_is_cut(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    which = problem(plants=7, constraints=Constraints(ms=2.0))
+    candidates = np.random.default_rng(1).uniform([0.5, 0.5, 0.0], [6.0, 3.0, 0.3], (5, 3))
+    whole = Objective(which, threads=1)(candidates)
+    monkeypatch.setattr("tdof_npid_ros.tuning.perturbed.LEAST_LOOPS", 1)
+    chunks = which.plants_judge.chunks(len(candidates), 4 * threads)
+    assert [i for chunk in chunks for i in range(7)[chunk]] == list(range(7)) and len(chunks) == min(4 * threads, 7)
+    cut = Objective(which, threads=threads)(candidates)
+    assert cut.objective.tobytes() == whole.objective.tobytes()
+    assert cut.violation.tobytes() == whole.violation.tobytes()
 
 
 def test_what_is_unstable_at_a_corner_of_the_spreads_is_not_allowed() -> None:
