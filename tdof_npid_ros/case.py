@@ -31,9 +31,9 @@ from tdof_npid_ros.plants.noise import largest_noise, noiseless
 from tdof_npid_ros.plants.ode import class_by_value, take_class
 from tdof_npid_ros.plants.per_lane import LanePlants, lane_plants
 from tdof_npid_ros.plants.plant import Plant, one_plant
-from tdof_npid_ros.plotting import Units
 from tdof_npid_ros.responses import largest_move
 from tdof_npid_ros.scenario import Plan, PlanError, SampledPlan, parse_plan, read_episodes
+from tdof_npid_ros.units import Units
 
 Bounds = tuple[float, float]
 EPISODES = ("setpoint", "disturbance")

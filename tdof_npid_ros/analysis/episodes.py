@@ -21,9 +21,9 @@ from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.session import FAR_NS
 from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.noise import largest_noise
-from tdof_npid_ros.plotting import Units
 from tdof_npid_ros.responses import ROUNDING, Lane, largest_move
 from tdof_npid_ros.scenario import LARGEST_PLAN, Plan, PlanError
+from tdof_npid_ros.units import Units
 from tdof_npid_ros.wire import AnswerLabel, EpisodeLabel
 
 LONGEST_GAP_NS = 3600 * 10**9  # between stamps of one recording; a robot's first message may be stamped 0 …

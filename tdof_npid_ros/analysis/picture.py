@@ -9,7 +9,8 @@ import numpy as np
 
 from tdof_npid_ros.analysis.episodes import Episode, bag_names
 from tdof_npid_ros.control.law import limits_of
-from tdof_npid_ros.plotting import Curve, Panel, common_units, draw_responses
+from tdof_npid_ros.plotting import Curve, Panel, draw_responses
+from tdof_npid_ros.units import common_units
 
 MOST_COLUMNS = 6
 MOST_LANES = 7  # of an episode: as many as there are colours

@@ -21,9 +21,9 @@ from tdof_npid_ros.metrics import DisturbanceMetrics, EffortUse, SetpointMetrics
 from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameters import NOISE, PLANT
 from tdof_npid_ros.plants.catalog import model_parameters
-from tdof_npid_ros.plotting import common_units
 from tdof_npid_ros.responses import NO_SETPOINT, Response, responses
 from tdof_npid_ros.stability.margins import Margins
+from tdof_npid_ros.units import common_units
 
 LANES_SHOWN = 7  # of an episode, in tables for people, as many as there are colours; JSON and CSV hold all
 # Column of the table and of the CSV: title, and how a person reads a value.

@@ -20,9 +20,9 @@ from tdof_npid_ros.live.plots import ROLLOVER, LivePlots, at_lane
 from tdof_npid_ros.live.step import Steps
 from tdof_npid_ros.live.tune_controls import TuneControls
 from tdof_npid_ros.live.view import LiveLoop, View, of_lane
-from tdof_npid_ros.plotting import Units
+from tdof_npid_ros.units import Units
 
-REFRESH_MS = 50  # plots
+REFRESH_MS = 20  # plots, at most so often
 LOOK_MS = 500  # numbers, widgets and diagnostics
 WINDOW = 20.0  # s that scroll by, at first, of a loop of which no case is known
 LOOP_CSS = """
@@ -125,9 +125,9 @@ class LivePage:
 
     def refresh(self) -> None:
         """Send what has come since, unless the browser is not there yet with what it has."""
-        if self._plots.is_behind:
-            return
         observer, lane = self._view.loop.observer, self._view.lane
+        if self._plots.waits(observer.latest, lane):
+            return
         rows, self._seen = observer.rows_since(self._seen)
         terms, self._seen_terms = observer.terms_since(self._seen_terms)
         if terms:

@@ -16,7 +16,8 @@ from tdof_npid_ros.control.law import TERMS as LAW_TERMS
 from tdof_npid_ros.graph.observer import Row, Terms
 from tdof_npid_ros.interactive import INK, corners, draw, finish_legend, new_plot
 from tdof_npid_ros.live.step import StepResponse
-from tdof_npid_ros.plotting import GUIDE, PALETTE, Curve, Panel, Units, effort_notes, effort_range, shown_until
+from tdof_npid_ros.plotting import GUIDE, PALETTE, Curve, Panel, effort_notes, effort_range, shown_until
+from tdof_npid_ros.units import Units
 
 ROLLOVER = 4000  # points of a curve that a browser holds
 MOST_AT_ONCE = 400  # points that one refresh sends; a faster loop is thinned
@@ -27,8 +28,17 @@ SIGNALS = ("setpoint", "output")
 EFFORTS = ("effort", "applied")
 TERMS = ("P", "I", "D")
 STEPS = ("latest step", "the one before")
-TAKEN = "cb_obj.tags = [cb_obj.data.time.at(-1)]"  # a browser tells by a source's tags how far it is
+# A browser follows the newest, unless its user has moved the plots elsewhere; "reset" brings them back. (With Bokeh's
+# own following every plot is painted twice.) It tells how far it is, once that has been painted.
+FOLLOW = """
+const at = cb_obj.data.time.at(-1)
+const newest = {reset_start: at - span, reset_end: at}
+range.setv(range.end === range.reset_end ? {start: at - span, end: at, ...newest} : newest)
+requestAnimationFrame(() => setTimeout(() => { far.tags = [at] }))
+"""
 PATIENCE = 1.0  # s without a word from a browser, after which it is sent more all the same
+REST = 3.0  # times as long as it painted last, it may do something else: on few cores the loop runs there, too
+JUMP = 0.1  # of its plot's range: an effort that moves so far is shown at once, as is another setpoint
 
 
 class LivePlots:
@@ -47,13 +57,17 @@ class LivePlots:
         self._least = LEAST_SHOWN * step
         self._signals, self._terms = map(_empty, ((*SIGNALS, *EFFORTS), TERMS))
         self._steps = [_empty([name]) for name in STEPS]
-        self._signals.js_on_change("streaming", CustomJS(code=TAKEN))
+        self._far = ColumnDataSource()  # its tags: the time that the browser has painted last; nothing is drawn of it
+        self._far.on_change("tags", lambda _, __, new: self._painted(new))
         self._last: Row | None = None
-        self._sent_at = 0.0
+        self._sent_at = self._rest_until = 0.0
         self._limits = (-math.inf, math.inf)
-        output = new_plot(units.titled("output", "{output}"), 270, x_label="", name="output_plot")
-        self._effort = effort = new_plot(units.titled("effort", "{effort}"), 190, x_label="", x_range=output.x_range)
-        terms = new_plot(units.titled("P, I, D", "{effort}"), 190, x_range=output.x_range)
+        time = Range1d(-window, 0.0, reset_start=-window, reset_end=0.0, syncable=False)  # each browser's own matter
+        follow = CustomJS(args={"range": time, "span": window, "far": self._far}, code=FOLLOW)
+        self._signals.js_on_change("streaming", follow)
+        output = new_plot(units.titled("output", "{output}"), 270, x_label="", x_range=time, name="output_plot")
+        self._effort = effort = new_plot(units.titled("effort", "{effort}"), 190, x_label="", x_range=time)
+        terms = new_plot(units.titled("P, I, D", "{effort}"), 190, x_range=time)
         self._output, self._parts = output, terms
         output.y_range, effort.y_range, terms.y_range = (Range1d(-1.0, 1.0) for _ in range(3))
         after_step = new_plot("part of the step", 240, x_label="time since the step (s)")
@@ -75,15 +89,30 @@ class LivePlots:
             finish_legend(plot)
         for plot in (effort, terms, after_step):
             plot.toolbar_location = None
-        output.x_range.syncable = False  # where a browser has scrolled to is its own matter
-        output.x_range.follow, output.x_range.follow_interval, output.x_range.range_padding = "end", window, 0.0
         self.layout = column(output, effort, terms, after_step, name="plots", sizing_mode="stretch_width")
 
-    @property
-    def is_behind(self) -> bool:
-        """Whether the browser is still at what it was sent last: on a busy machine, more would only wait in a queue."""
-        waits = self._signals.tags and self._last is not None and self._signals.tags != [self._last.time]
-        return bool(waits) and clock.monotonic() - self._sent_at < PATIENCE
+    def _painted(self, tags: list[Any]) -> None:
+        if self._last is not None and tags == [self._last.time]:
+            now = clock.monotonic()
+            self._rest_until = now + REST * (now - self._sent_at)
+
+    def waits(self, latest: Row | None, lane: int) -> bool:
+        """Whether the browser is to be sent nothing yet.
+
+        It is still at what it was sent last, and on a busy machine more would only wait in a queue; or it has just
+        painted, and nothing has happened since.
+        """
+        now = clock.monotonic()
+        if self._last is None or latest is None or now - self._sent_at > PATIENCE:
+            return False
+        if self._far.tags and self._far.tags != [self._last.time]:
+            return True
+        moved, kicked = (
+            abs(at_lane(getattr(latest, name), lane) - at_lane(getattr(self._last, name), lane))
+            for name in ("setpoint", "effort")
+        )
+        shown = self._effort.y_range
+        return now < self._rest_until and not (moved > 0.0 or kicked > JUMP * (shown.end - shown.start))
 
     def clear(self) -> None:
         """Begin anew, with another loop or lane."""
