@@ -107,6 +107,7 @@ class LoopObserver:
         self.lane_names: tuple[str, ...] = ()
         self.nodes: dict[str, NodeState] = {}
         self._outputs: dict[int, Sample] = {}
+        self._early: dict[int, Sample] = {}  # answers whose output, sent to the controller first, is not here yet
         self._labels: dict[str, int] = {}
         self._label: str | None = None  # of the latest output; a robot may bear none
         self._base = self._last = 0.0  # s: when the present label came, and the latest answer
@@ -164,6 +165,8 @@ class LoopObserver:
                     self._outputs[sample.stamp_ns] = sample
                     if len(self._outputs) > LOOKING_ON.depth:
                         del self._outputs[next(iter(self._outputs))]
+                    if (early := self._early.get(sample.stamp_ns)) is not None:
+                        self._take_answer(early)
                 elif topic == "control_effort":
                     self._take_answer(sample)
                 elif len(sample.position) % len(TERMS) == 0:
@@ -173,7 +176,11 @@ class LoopObserver:
     def _take_answer(self, answer: Sample) -> None:
         output = self._outputs.pop(answer.stamp_ns, None)
         if output is None:
+            self._early[answer.stamp_ns] = answer
+            if len(self._early) > LOOKING_ON.depth:
+                del self._early[next(iter(self._early))]
             return
+        self._early.clear()  # the others' outputs came before this one, or never will
         if output.frame_id != self._label:
             self._label, self._began_ns = output.frame_id, answer.stamp_ns
             self._base = self._last
@@ -205,6 +212,12 @@ class LoopObserver:
         """What the answers are made of, likewise."""
         with self._lock:
             return _latest(self.terms, self.term_count - count), self.term_count
+
+    @property
+    def latest(self) -> Row | None:
+        """The latest answer."""
+        with self._lock:
+            return self.rows[-1] if self.rows else None
 
     @property
     def runs(self) -> bool:
