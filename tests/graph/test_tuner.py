@@ -385,6 +385,21 @@ def test_it_ends_with_the_generation_and_leaves_the_best_so_far(
     assert loops.get_parameters("/p3/plant", "lanes") == [1]
 
 
+@pytest.mark.parametrize(("episode", "ms"), [("reset", 1.7), ("alternate", 0.0)])
+def test_what_the_case_s_file_asks_of_the_search_holds(
+    loops: Any, tuner_file: Callable[[str], Path], episode: str, ms: float
+) -> None:
+    """As in `tdof-npid tune FILE`; a margin only where there is a model."""
+    case = tuner_file("p1-c0.5")
+    case.write_text(case.read_text().replace("    bounds:\n", "    ms: 1.7\n    free: sigma\n    bounds:\n"))
+    waiting = loops.start(
+        "tuner", "-p", f"case:={case}", namespace=f"/asked/{episode}", type="npid", episode=episode, autostart=False
+    )
+    loops.wait_for_nodes(f"/asked/{episode}/tuner")
+    assert loops.get_parameters(f"/asked/{episode}/tuner", "ms", "free") == [ms, "sigma"]
+    waiting.stop()
+
+
 # A plant that cannot be reset
 
 

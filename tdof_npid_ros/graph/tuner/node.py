@@ -6,7 +6,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +33,7 @@ from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
 from tdof_npid_ros.tuning.study import Study
 
 FAILURE = 2  # exit status
+SEARCHED = ("free", *(one.name for one in fields(Constraints)))  # what a case's file may ask of the search
 
 
 class InterruptedTuningError(RuntimeError):
@@ -124,7 +125,11 @@ class TunerNode(LoopNode):
     # Parameters
 
     def _declared_case(self) -> Case:
-        """The case, with the bounds and the weight that were given to the tuner itself; all is declared."""
+        """The case, with the bounds and the weight that were given to the tuner itself; all is declared.
+
+        What the case's file asks of the search holds where the tuner is not given it: margins only where there is a
+        model to have them.
+        """
         name = self.declare(TUNER["case"])
         if not name:
             raise ParameterError("the tuner needs its parameter case: a case's name or its parameter file")
@@ -133,7 +138,9 @@ class TunerNode(LoopNode):
             case = load_case(name)
         for warning in told:
             self.get_logger().warning(str(warning.message))
-        its = {f"bounds.{gain}": list(bounds) for gain, bounds in case.bounds.items()}
+        its: dict[str, Any] = {f"bounds.{gain}": list(bounds) for gain, bounds in case.bounds.items()}
+        asked = ("free",) if self.declare(TUNER["episode"]) == "alternate" else SEARCHED
+        its |= {name: case.search[name] for name in asked if name in case.search}
         unbounded = BOUNDS.keys() - its.keys() - self._parameter_overrides.keys()
         table = {name: parameter for name, parameter in TUNER.items() if name not in unbounded}
         population = self.declare(TUNER["population"])
