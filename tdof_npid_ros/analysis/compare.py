@@ -80,16 +80,19 @@ class Comparison:
     Attributes:
         equal, different: answers, bit for bit.
         largest: difference, in the effort's unit.
+        unexplained: of the different ones, those before which no live answer of the episode had other parameters.
         other_parameters: digests of live answers that were not computed with the recorded parameters.
         failure: why the comparison ended early.
     """
 
     equal: int = 0
     different: int = 0
+    unexplained: int = 0
     largest: float = 0.0
     first: str = ""
     other_parameters: set[str] = field(default_factory=set)
     failure: str = ""
+    _of_other_parameters: set[EpisodeLabel | None] = field(default_factory=set)  # episodes with such an answer
 
     @property
     def compared(self) -> int:
@@ -99,7 +102,7 @@ class Comparison:
     @property
     def sound(self) -> bool:
         """Whether something was compared, and differs only where the parameters do."""
-        return not self.failure and self.compared > 0 and (not self.different or bool(self.other_parameters))
+        return not self.failure and self.compared > 0 and not self.unexplained
 
     def take(self, recorded: Recorded, key: Key, digest: str, effort: np.ndarray) -> None:
         """Compare one live answer, effort (lanes,)."""
@@ -108,10 +111,12 @@ class Comparison:
         its_digest, expected = recorded.answers[key]
         if digest != its_digest:
             self.other_parameters.add(digest)
+            self._of_other_parameters.add(key[0])
         if effort.tobytes() == expected.tobytes():
             self.equal += 1
             return
         self.different += 1
+        self.unexplained += key[0] not in self._of_other_parameters
         if not self.first:
             place = f"at {key[1] / 1e9:.9g} s of {key[0] or 'the recording'}"
             self.first = f"{place}: {effort.tolist()}, recorded {expected.tolist()}"
@@ -123,6 +128,7 @@ class Comparison:
         return {
             "equal": self.equal,
             "different": self.different,
+            "unexplained": self.unexplained,
             "largest_difference": self.largest,
             "first_difference": self.first,
             "other_parameters": sorted(self.other_parameters),
