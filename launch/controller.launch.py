@@ -30,5 +30,8 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(value: dict[str, str]) -> list[Any]:
     remapped = [(topic, value[topic]) for topic in REMAPPED if value[topic] != topic]
-    controller = node("controller", value, ARGUMENTS, [value["params"]], name=value["name"], remappings=remapped)
-    return [*([node("recorder", value, ARGUMENTS)] if value["bag"] else []), controller]
+    roles = {"recorder": "recorder"} if value["bag"] else {}  # hears the same topics, in the same way
+    roles |= {"controller": value["name"]}
+    return [
+        node(role, value, ARGUMENTS, [value["params"]], name=name, remappings=remapped) for role, name in roles.items()
+    ]

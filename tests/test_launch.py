@@ -129,8 +129,12 @@ def test_a_robot_s_controller_is_remapped_and_recorded_if_a_bag_is_given() -> No
     (controller,) = started("controller", params="arm.yaml", name="arm", output="joint_states", setpoint="goal")
     assert controller.remappings == [("output", "joint_states"), ("setpoint", "goal")]
     assert (controller.name, controller.parameters) == ("arm", ["arm.yaml"])
-    recorder, _ = started("controller", params="arm.yaml", bag="bags/arm", namespace="left")
-    assert (recorder.parameters, recorder.namespace) == ([{"bag": "bags/arm"}], "left")
+    recorder, controller = started(
+        "controller", params="arm.yaml", bag="bags/arm", namespace="left", name="arm", output="joint_states"
+    )
+    assert (recorder.parameters, recorder.namespace) == (["arm.yaml", {"bag": "bags/arm"}], "left")
+    assert recorder.remappings == [("output", "joint_states")]  # listens to them, and as the controller does
+    assert (recorder.name, controller.name) == ("recorder", "arm")
     with pytest.raises(AssertionError, match="must be given"):
         started("controller")
 

@@ -44,7 +44,7 @@ def test_colcon_installs_what_ros2_run_and_launch_look_for(installed: Path) -> N
     assert (share / "ament_index" / "resource_index" / "packages" / "tdof_npid_ros").is_file()
     assert (share / "tdof_npid_ros" / "package.xml").is_file()
     launch = {path.name for path in (share / "tdof_npid_ros" / "launch").iterdir()}
-    assert {"demo.launch.py", "loop.launch.py", "controller.launch.py"} <= launch
+    assert launch == {f"{name}.launch.py" for name in ("loop", "controller", "tuner", "replay")}
     assert len(list((share / "tdof_npid_ros" / "config").glob("*.yaml"))) >= 7
 
 
