@@ -80,7 +80,7 @@ def flips(messages: Messages, topic: str) -> Iterator[tuple[int, int, int, Messa
 
 
 def says_the_same(reader: BagReader, topic: str, one: bytes, other: bytes) -> bool:
-    """Whether the flipped bit lies in padding, in the encoding's unused options, or makes 0 of 0.0."""
+    """Whether the flipped bit lies in padding, in the encoding's unused options, or writes a number in another way."""
     try:
         return repr(plain(reader.decode(topic, one))) == repr(plain(reader.decode(topic, other)))
     except BagError:
@@ -90,11 +90,21 @@ def says_the_same(reader: BagReader, topic: str, one: bytes, other: bytes) -> bo
 def plain(value: object) -> object:
     if isinstance(value, dict):
         if value.get("type") == DOUBLE and value["double_value"] == 0.0:
-            value = value | {"type": INTEGER}  # a parameter file may give 0 for 0.0: the same parameter
+            value = value | {"type": INTEGER, "double_value": 0.0}  # 0 and -0.0 for 0.0: the same parameter
+        if lines := value.get("string_array_value"):
+            value = value | {"string_array_value": [list(map(word, line.split())) for line in lines]}
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return value.tobytes()
     return [plain(item) for item in value] if isinstance(value, list) else value
+
+
+def word(text: str) -> float | str:
+    """A plan's line may say .5 for 0.5."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def test_the_bag_is_verified(messages, tmp_path) -> None:
