@@ -113,4 +113,4 @@ LOOPS = {
         first(-2.0, 12.0, 3.0, output_offset=150.0, noise=0.1), (-0.5, -0.03), 50.0, (0.0, 100.0), 10.0, PER_CENT
     ),
 }  # fmt: skip
-QUICK = ("heater by hand",)
+QUICK = ("heater by hand", "motor", "tank", "integrator", "inverse response")
