@@ -52,7 +52,9 @@ def add_experiment_arguments(parser: argparse.ArgumentParser) -> None:
         told = f"of {of} at the most (default: {limit[0]:g}, or {limit[1]} samples where that is longer)"
         parser.add_argument(f"--{what}", type=float, metavar="S", help=told)
     parser.add_argument("--patience", type=float, default=30.0, metavar="S", help="to wait for rest (default: 30)")
-    parser.add_argument("--bag", type=Path, metavar="DIR", help="record to this new folder (default: bags/<date>)")
+    parser.add_argument(
+        "--bag", type=Path, metavar="DIR", help="record to this new folder (default: in bags/, by the date)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.cli.scheduler import add_scheduler_argument
+from tdof_npid_ros.cli.simulate import written
 from tdof_npid_ros.cli.tune import add_constraint_arguments, constraints_of
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType, controller_type
 from tdof_npid_ros.output_file import check_writable
@@ -92,7 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
         weight = 1.0 if arguments.weight is None else arguments.weight
         index = fronts[0].best(weight) if arguments.index is None else arguments.index
         write_parameters(arguments.write, fronts[0].parameters(index))
-    print(json.dumps({"seed": arguments.seed, "points": rows}) if arguments.json else _table(fronts))
+    lines = [_table(fronts), *written([path for path in (arguments.out, arguments.write) if path])]
+    print(json.dumps({"seed": arguments.seed, "points": rows}) if arguments.json else "\n".join(lines))
     return 0
 
 

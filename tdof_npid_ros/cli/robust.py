@@ -10,6 +10,7 @@ from typing import cast
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli.gains import add_gain_arguments, chosen_gains, headline
 from tdof_npid_ros.cli.scheduler import add_scheduler_argument
+from tdof_npid_ros.cli.simulate import written
 from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file, write_parameters
 from tdof_npid_ros.robustness import RobustError
@@ -58,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the sweep, print its report, and write what was asked for."""
     if arguments.resume and not arguments.checkpoint:
         raise RobustError("--resume needs --checkpoint FILE: what to go on from")
-    written = [path for path in (arguments.plot, arguments.html, arguments.checkpoint) if path]
-    check_outputs(written + _worst_files(arguments.out), [find_parameter_file(arguments.case)])
+    outputs = [path for path in (arguments.plot, arguments.html, arguments.checkpoint) if path]
+    check_outputs(outputs + _worst_files(arguments.out), [find_parameter_file(arguments.case)])
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
     sampling = cast(Sampling, arguments.sampling)
@@ -75,7 +76,9 @@ def run(arguments: argparse.Namespace) -> int:
         draw(result, arguments.plot)
     if arguments.html:
         page(result).write(arguments.html)
-    print(json.dumps(result.as_dict()) if arguments.json else "\n".join([headline(case, gains), *result.lines()]))
+    lines = [headline(case, gains), *result.lines()]
+    lines += written([path for path in (*_worst_files(arguments.out), arguments.plot, arguments.html) if path])
+    print(json.dumps(result.as_dict()) if arguments.json else "\n".join(lines))
     return 0
 
 
