@@ -30,8 +30,10 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(value: dict[str, str]) -> list[Any]:
     remapped = [(topic, value[topic]) for topic in REMAPPED if value[topic] != topic]
-    roles = {"recorder": "recorder"} if value["bag"] else {}  # hears the same topics, in the same way
-    roles |= {"controller": value["name"]}
-    return [
-        node(role, value, ARGUMENTS, [value["params"]], name=name, remappings=remapped) for role, name in roles.items()
-    ]
+
+    def started(executable: str, name: str) -> Any:
+        return node(executable, value, ARGUMENTS, [value["params"]], name=name, remappings=remapped)
+
+    controller = started("controller", value["name"])
+    # The recorder hears the same topics, in the same way.
+    return [started("recorder", "recorder"), controller] if value["bag"] else [controller]

@@ -92,7 +92,9 @@ class Comparison:
     first: str = ""
     other_parameters: set[str] = field(default_factory=set)
     failure: str = ""
-    _of_other_parameters: set[EpisodeLabel | None] = field(default_factory=set)  # episodes with such an answer
+    _of_other_parameters: set[EpisodeLabel | None] = field(
+        default_factory=set, init=False
+    )  # episodes with such answers
 
     @property
     def compared(self) -> int:

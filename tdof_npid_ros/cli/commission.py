@@ -106,8 +106,8 @@ def _commission(
             say(f"not yet: {error}")
             continue
         work.design = design
-        more = "a larger experiment" if arguments.size is None else "another experiment"
         if design.ms - 1.0 < TIGHT * (arguments.ms - 1.0) and number + 1 < MOST_EXPERIMENTS:
+            more = "a larger experiment" if arguments.size is None else "another experiment"
             say(f"not yet: for what the record leaves open, M_s would have to be {design.ms:.3g}; {more}")
             continue
         say("\n".join([found.reason, *lines_of(design)]))

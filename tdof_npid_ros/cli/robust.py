@@ -60,7 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.resume and not arguments.checkpoint:
         raise RobustError("--resume needs --checkpoint FILE: what to go on from")
     outputs = [path for path in (arguments.plot, arguments.html, arguments.checkpoint) if path]
-    check_outputs(outputs + _worst_files(arguments.out), [find_parameter_file(arguments.case)])
+    worst_files = _worst_files(arguments.out)
+    check_outputs(outputs + worst_files, [find_parameter_file(arguments.case)])
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
     sampling = cast(Sampling, arguments.sampling)
@@ -70,14 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
             here, case, gains, spreads, count=arguments.samples, sampling=sampling, seed=arguments.seed,
             checkpoint=arguments.checkpoint, resume=arguments.resume,
         )  # fmt: skip
-    for path, index in zip(_worst_files(arguments.out), result.worst(), strict=False):
+    worst = dict(zip(worst_files, result.worst(), strict=False))
+    for path, index in worst.items():
         write_parameters(path, result.parameters(index))
     if arguments.plot:
         draw(result, arguments.plot)
     if arguments.html:
         page(result).write(arguments.html)
     lines = [headline(case, gains), *result.lines()]
-    lines += written([path for path in (*_worst_files(arguments.out), arguments.plot, arguments.html) if path])
+    lines += written([path for path in (*worst, arguments.plot, arguments.html) if path])
     print(json.dumps(result.as_dict()) if arguments.json else "\n".join(lines))
     return 0
 

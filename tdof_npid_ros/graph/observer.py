@@ -162,9 +162,7 @@ class LoopObserver:
                 except ValueError:
                     continue  # the nodes refuse it, and tell
                 if topic == "output":
-                    self._outputs[sample.stamp_ns] = sample
-                    if len(self._outputs) > LOOKING_ON.depth:
-                        del self._outputs[next(iter(self._outputs))]
+                    _keep(self._outputs, sample)
                     if (early := self._early.get(sample.stamp_ns)) is not None:
                         self._take_answer(early)
                 elif topic == "control_effort":
@@ -176,9 +174,7 @@ class LoopObserver:
     def _take_answer(self, answer: Sample) -> None:
         output = self._outputs.pop(answer.stamp_ns, None)
         if output is None:
-            self._early[answer.stamp_ns] = answer
-            if len(self._early) > LOOKING_ON.depth:
-                del self._early[next(iter(self._early))]
+            _keep(self._early, answer)
             return
         self._early.clear()  # the others' outputs came before this one, or never will
         if output.frame_id != self._label:
@@ -266,6 +262,13 @@ def lanes_of(output: Sample, answer: Sample) -> tuple[np.ndarray, np.ndarray]:
         return y, applied  # the lanes bear other names here and there
     joints = Joints(answer.name)
     return joints.selected(output.name, y), joints.selected(output.name, applied)
+
+
+def _keep(kept: dict[int, Sample], sample: Sample) -> None:
+    """Keep a sample by its stamp, and of many the latest ones."""
+    kept[sample.stamp_ns] = sample
+    if len(kept) > LOOKING_ON.depth:
+        del kept[next(iter(kept))]
 
 
 def _latest(kept: deque[T], number: int) -> list[T]:

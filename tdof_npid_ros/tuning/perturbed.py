@@ -133,11 +133,9 @@ class PlantsJudge:
 
     def together(self, gains: Gains, parts: Sequence[Scores]) -> Scores:
         """The scores (n,) of candidates from those with the plants of each chunk."""
-        objective, violation = (
-            np.hstack([values.reshape(gains.lanes, -1) for values in each])
-            for each in zip(*((part.objective, part.violation) for part in parts), strict=True)
-        )
-        value = self._perturbed.together(np.ascontiguousarray(objective.T))
+        objective = np.hstack([part.objective.reshape(gains.lanes, -1) for part in parts])
+        violation = np.hstack([part.violation.reshape(gains.lanes, -1) for part in parts])
+        value = self._perturbed.together(objective.T)
         if self._corners:
             stable = self._corners(gains, modes=False).stable.reshape(gains.lanes, -1)
             violation = np.hstack([violation, np.where(stable, 0.0, UNSTABLE)])

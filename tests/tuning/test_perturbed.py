@@ -59,6 +59,7 @@ def test_a_score_is_put_together_from_those_of_each_plant_alone(by: str | float)
     np.testing.assert_allclose(found.objective, put_together, rtol=1e-14)
     allowed = np.max([scores.violation for scores in alone], axis=0) == 0.0
     assert np.all(allowed[found.violation == 0.0])
+    np.testing.assert_array_equal(found.objective, Objective(together, threads=1)(candidates).objective)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
