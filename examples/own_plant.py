@@ -18,6 +18,7 @@ from tdof_npid_ros import analyze, run
 PARAMETERS = Path(__file__).with_name("cart.yaml")
 PERIOD = 0.01  # s
 PERIOD_NS = 10_000_000
+DEPTH = 1000  # messages kept for a recorder that is behind on a busy machine
 
 
 class Cart(Node):
@@ -29,7 +30,7 @@ class Cart(Node):
         super().__init__("cart", **how)
         self.position = self.velocity = self.force = self.time = 0.0
         self.stamp_ns = self.get_clock().now().nanoseconds
-        self.publisher = self.create_publisher(JointState, "output", 10)
+        self.publisher = self.create_publisher(JointState, "output", DEPTH)
         self.create_subscription(JointState, "control_effort", self.on_effort, 10)
         self.create_timer(PERIOD, self.step)
 

@@ -160,14 +160,16 @@ def _trial(
     base = rest.output if loop.options.manual else rest.setpoint
     proposal = proposal_of(loop, rest._replace(setpoint=base), wanted, "step")
     _, longest = longest_of(loop, arguments)
+    target = base + proposal.size
+    watched = settling_time(design, proposal.size)  # computed before the loop is held, for the lease is short
     with Hold(loop, "confirm", proposal.safe_output, proposal.safe_effort, longest) as hold:
         hold.apply({**design.settings, "manual": False, "experiment_setpoint": base})
         hold.wait(SETTLES * design.horizon)
         before = hold.taken[-REST_SAMPLES:]
         now = rest_of(*signals_of(before), tolerance=0.0)
-        first, target = len(hold.taken), base + proposal.size
+        first = len(hold.taken)
         hold.move(setpoint=target)
-        hold.wait(settling_time(design, target - base))
+        hold.wait(watched)
         rows = hold.taken[first:]
         rows = rows[next((i for i, row in enumerate(rows) if row.setpoint[0] == target), 0) :]
         y, _, r = signals_of(rows)

@@ -25,6 +25,7 @@ from typing import Any
 
 import pytest
 from dds_domain import reserved_domain
+from forked import ForkedNode
 
 from tdof_npid_ros.graph.runtime.middleware import PROFILE, RANGE, stay_on_this_machine
 from tdof_npid_ros.parameter_file import read_parameters, write_parameters
@@ -47,7 +48,12 @@ REPEAT_PERIOD = 0.1  # s between two times that `publish_until` publishes
 
 
 class NodeProcess:
-    """A node in a process of its own; what it prints is in `log`."""
+    """A node in a process of its own; what it prints is in `log`.
+
+    Args:
+        program: Python that runs it; empty: ours.
+        fresh: whether it starts as a command does, which takes ten times as long.
+    """
 
     def __init__(
         self,
@@ -55,22 +61,24 @@ class NodeProcess:
         arguments: Sequence[str],
         environment: dict[str, str],
         log: Path,
-        cwd: Path = REPOSITORY,
-        program: str = "",
+        cwd: Path,
+        program: str,
+        fresh: bool,
     ) -> None:
-        """Args: program: Python that runs it; empty: ours."""
         self.node = node
         self._log = log
         self.expected_status: int | None = 0
         self.stopped = False
+        self.process: subprocess.Popen[bytes] | ForkedNode
         with log.open("w") as stream:
-            self.process = subprocess.Popen(
-                [sys.executable, *(["-c", program] if program else ["-m", "tdof_npid_ros.graph", node]), *arguments],
-                stdout=stream,
-                stderr=subprocess.STDOUT,
-                cwd=cwd,
-                env=environment,
-            )
+            if program or fresh:
+                what = ["-c", program] if program else ["-m", "tdof_npid_ros.graph", node]
+                self.process = subprocess.Popen(
+                    [sys.executable, *what, *arguments], stdout=stream, stderr=subprocess.STDOUT, cwd=cwd,
+                    env=environment,
+                )  # fmt: skip
+            else:
+                self.process = ForkedNode([node, *arguments], environment, stream, cwd)
 
     @property
     def log(self) -> str:
@@ -124,6 +132,7 @@ class Graph:
             "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]),
         }
         stay_on_this_machine(self.environment)
+        self._usual = dict(self.environment)
         os.environ.update({name: self.environment[name] for name in (PROFILE, RANGE)})
         self.processes: list[NodeProcess] = []
         self._context = rclpy.Context()
@@ -174,6 +183,7 @@ class Graph:
         namespace: str = "",
         cwd: Path = REPOSITORY,
         program: str = "",
+        fresh: bool = False,
         **parameters: Any,
     ) -> NodeProcess:
         """Start a node.
@@ -184,6 +194,7 @@ class Graph:
             namespace: to start it in.
             cwd: folder to start it in.
             program: Python that runs it, in place of ours.
+            fresh: start it as a command does; so it is, too, where the environment was changed.
             parameters: after those of the case; dots in names as double underscores; None: left out.
         """
         values = dict(parameters)
@@ -201,7 +212,8 @@ class Graph:
             write_parameters(file, {node: {name.replace("__", "."): plain(value) for name, value in values.items()}})
             command += ["--params-file", str(file)]
         log = self.folder / f"{node}-{len(self.processes)}.log"
-        process = NodeProcess(node, command, self.environment, log, cwd, program)
+        fresh = fresh or self.environment != self._usual
+        process = NodeProcess(node, command, self.environment, log, cwd, program, fresh)
         self.processes.append(process)
         return process
 

@@ -120,17 +120,17 @@ def test_distributed_equals_local_with_an_operator_s_settings(graph: Any) -> Non
 
 def test_nodes_start_in_any_order_in_a_namespace_and_end_at_once(graph: Any) -> None:
     scenario = graph.start("scenario", namespace="/a", mode="lockstep", episodes=["e"],
-                           plan__e=["0 setpoint 1", "1 end"])  # fmt: skip
+                           plan__e=["0 setpoint 1", "1 end"], fresh=True)  # fmt: skip
     graph.wait_for_nodes("/a/scenario")
-    controller = graph.start("controller", namespace="/a")
-    plant = graph.start("plant", namespace="/a", mode="lockstep")
+    controller = graph.start("controller", namespace="/a", fresh=True)
+    plant = graph.start("plant", namespace="/a", mode="lockstep", fresh=True)
     graph.wait_until(lambda: graph.fact("/a/plant", "state") == "finished", 60, "the end of the episode")
     for process in (plant, controller, scenario):
         assert process.stop() < AT_ONCE
 
 
 def test_ctrl_c_again_and_again_while_it_is_loaded(graph: Any) -> None:
-    process = graph.start("plant")
+    process = graph.start("plant", fresh=True)
     maps = Path(f"/proc/{process.process.pid}/maps")
     graph.wait_until(lambda: "librcl" in maps.read_text(), what="the first library")
     process.stopped = True

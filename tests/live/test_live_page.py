@@ -20,7 +20,7 @@ from live_program import CHROMIUM, Program, eventually, model, needs_chromium, o
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.parameter_file import read_parameters
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.timeout(240), pytest.mark.alone]
 
 
 @pytest.fixture

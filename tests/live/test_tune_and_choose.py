@@ -11,7 +11,7 @@ from live_program import CHROMIUM, Program, eventually, model, needs_chromium, o
 
 from tdof_npid_ros.case import load_case
 
-pytestmark = pytest.mark.timeout(480)
+pytestmark = [pytest.mark.timeout(480), pytest.mark.alone]
 TWO_LANES = """
 /**: {ros__parameters: {sample_period: 0.01, mode: realtime}}
 plant: {ros__parameters: {model: first_order, gain: 2.0, time_constant: 0.5, lanes: 2}}
