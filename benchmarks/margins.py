@@ -10,12 +10,12 @@ from benchmarks.harness import Result, Table, Verdict, main, seconds, summary
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import KD_H, PHI, coefficients
-from tdof_npid_ros.paper.evaluation import published_gains
+from tdof_npid_ros.paper.evaluation import GENERATIONS, published_gains
 from tdof_npid_ros.paper.tables import ROWS, Published
 from tdof_npid_ros.stability.certificate import certify
 from tdof_npid_ros.stability.margins import margins
 from tdof_npid_ros.tuning.objective import Objective
-from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
+from tdof_npid_ros.tuning.problem import POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
 TITLE = "Margins and certificate"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from benchmarks.harness import Dots, Result, Table, Verdict, main, seconds, summary
 from tdof_npid_ros.case import load_case
+from tdof_npid_ros.paper.evaluation import GENERATIONS
 from tdof_npid_ros.paper.tables import ROWS
 from tdof_npid_ros.tuning.objective import Objective
-from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
+from tdof_npid_ros.tuning.problem import POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study
 from tdof_npid_ros.workers import available_cores
 

@@ -58,8 +58,8 @@ def test_from_a_few_facts_to_a_verified_loop(
     first = told("simulate", file, "--plot", "response.png")
     assert first["setpoint"]["settling_time_s"] is not None and Path("response.png").stat().st_size > 10_000
 
-    pid = told("tune", file, "--controller", "pid")
-    tuned = told("tune", file, "--controller", "tdof_npid2", "--out", "tuned.yaml")
+    pid = told("tune", file, "--controller", "pid", "--budget", "8000")
+    tuned = told("tune", file, "--controller", "tdof_npid2", "--budget", "8000", "--out", "tuned.yaml")
     assert tuned["objective"] <= pid["objective"] * 1.001 and tuned["objective"] <= first["objective"] * 1.001
     assert tuned["setpoint"]["settling_time_s"] is not None and tuned["margins"]["m_s"] <= 2.01
     assert told("simulate", file, "--gains", "tuned.yaml")["objective"] == tuned["objective"]

@@ -21,6 +21,7 @@ METRICS = {
     "iae_disturbance": "IAE_DIS (s)",
     "objective": "IAE_SP + IAE_DIS (s)",
 }
+GENERATIONS = 200  # of 40 candidates: a search of a row, 8,000 evaluations
 SIGMA_FREE_CASES = ("p3-c1", "p3-c2")  # their published NPID rows are out of reach with σ = 1
 
 

@@ -25,6 +25,7 @@ from tdof_npid_ros.paper.conclusions import (
 )
 from tdof_npid_ros.paper.evaluation import (
     CONTROLLER_TITLES,
+    GENERATIONS,
     Measured,
     Rows,
     RowSearch,
@@ -51,7 +52,6 @@ from tdof_npid_ros.tuning.pareto import (
     check_installed,
     fronts_of,
 )
-from tdof_npid_ros.tuning.problem import GENERATIONS
 from tdof_npid_ros.workers import ChunkCheckpoint, Workers
 
 TITLE = "Design of novel TDOF nonlinear PID controllers, reproduced"

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 from tdof_npid_ros.case import load_case
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType
 from tdof_npid_ros.paper import robust
+from tdof_npid_ros.paper.evaluation import GENERATIONS
 from tdof_npid_ros.paper.tables import CASES, ROWS, SIGMA
 from tdof_npid_ros.paper.tuned import FILE
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.pareto import POORER
-from tdof_npid_ros.tuning.problem import GENERATIONS
 from tdof_npid_ros.tuning.study import tune_case
 
 SEEDS = (0, 1)

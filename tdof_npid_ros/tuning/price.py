@@ -6,11 +6,11 @@ from dataclasses import replace
 
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.tuning.objective import Objective
-from tdof_npid_ros.tuning.problem import GENERATIONS, TuningProblem
+from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study, TuningResult
 
-FRACTION = 4
-"""Of a search's generations, one in so many is spent on the price, and of the usual search's at the most."""
+FRACTION, MOST = 4, 50
+"""Of a search's generations, one in so many is spent on the price, and so many at the most."""
 
 LEAST = 500
 """Evaluations: what fewer of them find says nothing about the price."""
@@ -25,7 +25,7 @@ def price_of_ms(problem: TuningProblem, gains: Gains, ms: float) -> TuningResult
         problem: the one that the gains were found for, with a linear model.
         gains: of the problem's controller.
     """
-    generations = min(problem.generations, GENERATIONS) // FRACTION
+    generations = min(problem.generations // FRACTION, MOST)
     if generations * problem.population < LEAST:
         return None
     held = replace(

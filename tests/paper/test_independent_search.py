@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
 
-from tdof_npid_ros.paper.evaluation import paper_case
+from tdof_npid_ros.paper.evaluation import GENERATIONS, paper_case
 from tdof_npid_ros.paper.robust import robust
 from tdof_npid_ros.paper.tables import ROWS, Published
 from tdof_npid_ros.paper.tuned import tuned
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective
-from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
+from tdof_npid_ros.tuning.problem import POPULATION, TuningProblem
 
 TIMES = 10  # the evaluations of a tuning run
 BETTER = 1e-3  # relative: what nothing may be
