@@ -11,7 +11,7 @@ from typing import Any
 from tdof_npid_ros.input_file import InputError, read_file
 from tdof_npid_ros.one_line import one_line
 
-VERSIONS = {"tuning": 2, "sweep": 1}
+VERSIONS = {"tuning": 3, "sweep": 1}
 """By what a checkpoint is of: the version that this program writes and reads."""
 
 LARGEST = 256 << 20  # bytes: more than the largest population, or the results of a million plants, take

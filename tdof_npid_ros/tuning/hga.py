@@ -22,6 +22,10 @@ a round about the best has found a better one, or a round from anywhere has not,
 from the best, one for each best. Once another has ended as low, rounds look elsewhere: what lies about the ends of all
 rounds before is not taken for good.
 
+And a valley may rise and then fall lower, far along it, as those of two-degree-of-freedom loops do along alpha. So
+then, too, or once five rounds are over, every other round stays in the half of one parameter's range in which the best
+does not lie, each parameter in turn, the last first, and begins about the best in the others.
+
 Half of each random population is drawn along the parameters' scales, half of it linearly: bounds that fit lie about
 the gains, bounds that are decades wide do not.
 
@@ -114,6 +118,8 @@ class HGAState(SearchState):
         round: restarts so far.
         about_best: whether this round began about the best of those before.
         elsewhere: whether it keeps away from where rounds before it ended.
+        half: the parameter, counted from 1, of whose range it stays in one half, `upper_half` says which; 0: of none.
+        halves: how many rounds have done so.
         round_began_at: the best value when this round began.
         age: generations told in this round; `began_after`: evaluations before it.
         searching: whether nothing allowed has been found yet.
@@ -129,6 +135,9 @@ class HGAState(SearchState):
     round: int = 0
     about_best: bool = False
     elsewhere: bool = False
+    half: int = 0
+    upper_half: bool = False
+    halves: int = 0
     round_began_at: float = math.inf
     age: int = 0
     began_after: int = 0
@@ -145,9 +154,9 @@ class HGAState(SearchState):
     walked_from: float = math.inf
 
 
-_COUNTS = ("evaluations", "generation", "round", "age", "began_after", "waited")
+_COUNTS = ("evaluations", "generation", "round", "age", "began_after", "waited", "half", "halves")
 _NUMBERS = ("best_value", "best_violation", "round_began_at", "goal", "penalty", "walked_from")
-_FLAGS = ("about_best", "elsewhere", "searching")
+_FLAGS = ("about_best", "elsewhere", "searching", "upper_half")
 
 
 class HGA(Optimizer):
@@ -213,14 +222,15 @@ class HGA(Optimizer):
     def _new_round(self) -> Array:
         """End the round, forget all but the global best, and draw the next one's population.
 
-        About the best if the round has found it, at all distances. Otherwise, if it is no walk, anywhere, densely at
-        the bounds: a valley that lies along one is often narrow, and a uniform population misses it.
+        About the best if the round has found it, at all distances, or in the other half of one parameter's range.
+        Otherwise, if it is no walk, anywhere, densely at the bounds: a valley that lies along one is often narrow, and
+        a uniform population misses it.
         """
         state = self._state
         if state.violations[0] > 0.0:
             state.penalty *= STIFFER
         was_about_best = state.about_best
-        if not was_about_best:
+        if not was_about_best and not state.half:
             self._note_end()
         confirmed = self._confirmed
         allowed = state.best_violation == 0.0
@@ -229,7 +239,8 @@ class HGA(Optimizer):
             state.walked_from = state.best_value
         walks = allowed and better == was_about_best and not confirmed and state.best_value < state.walked_from
         state.about_best = better or walks
-        state.elsewhere = confirmed and not state.about_best
+        self._choose_half(allowed and not state.about_best and (confirmed or state.round >= ROUNDS_TO_CONVERGE))
+        state.elsewhere = confirmed and not state.about_best and not state.half
         state.round_began_at = state.best_value
         state.round += 1
         self._forget()
@@ -237,11 +248,23 @@ class HGA(Optimizer):
         if state.walk:
             return state.walk.samples(self._random, self.polish)
         uniform: Array = self._random.random((self.population, self.dimension))
-        if state.about_best and state.best is not None:
+        if (state.about_best or state.half) and state.best is not None:
             reach = self._random.random((self.population, 1))
             about: Array = np.clip(state.best + reach * reach * reach * (2.0 * uniform - 1.0), 0.0, 1.0)
+            if state.half:
+                about[:, state.half - 1] = 0.5 * (uniform[:, state.half - 1] + state.upper_half)
             return about
         return self._half_linear(uniform * uniform * (3.0 - 2.0 * uniform))
+
+    def _choose_half(self, may: bool) -> None:
+        """Let the next round stay in the half in which the best does not lie, if it may and this one has not."""
+        state = self._state
+        if not may or state.half or state.best is None:
+            state.half = 0
+            return
+        state.half = self.dimension - state.halves % self.dimension
+        state.upper_half = bool(state.best[state.half - 1] < 0.5)
+        state.halves += 1
 
     def _note_end(self) -> None:
         """Where the round, begun anywhere, has ended, and how low."""
@@ -255,8 +278,11 @@ class HGA(Optimizer):
         state.ends = np.append(state.ends, lowest)
 
     def _away(self, told: Scores) -> Scores:
-        """The scores as this round takes them: elsewhere, what is near a known end is not allowed."""
+        """The scores as this round takes them: what lies where it keeps away from is not allowed."""
         state = self._state
+        if state.half:
+            beyond = (state.candidates[:, state.half - 1] < 0.5) == state.upper_half
+            return Scores(told.objective, told.violation + np.where(beyond, OUT_OF_QUESTION, 0.0))
         if not state.elsewhere:
             return told
         distances = np.abs(state.candidates[:, None] - state.end_points[None]).max(axis=2).min(axis=1)
@@ -437,6 +463,8 @@ def _decoded(state: dict[str, Any], dimension: int) -> HGAState:
         not isinstance(state[name], bool) for name in _FLAGS
     ):
         raise ValueError("points, objectives and violations")
+    if state["half"] > dimension:
+        raise ValueError("half")
     if (best is None) != (state["generation"] == 0) or (best is None) != (numbers["best_value"] == math.inf):
         raise ValueError("best")
     return HGAState(

@@ -17,7 +17,7 @@ import numpy as np
 from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, PER_LANE, ControllerType, Gains
 from tdof_npid_ros.tuning import TuningError
-from tdof_npid_ros.tuning.ask_tell import Array
+from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.judge import Constraints
 from tdof_npid_ros.tuning.objective import Objective, objective_values, scores
 from tdof_npid_ros.tuning.problem import TuningProblem, candidate_of
@@ -35,9 +35,6 @@ POORER: dict[ControllerType, ControllerType] = {"tdof_npid1": "npid", "tdof_npid
 LEAST_FOR_ENDS = 25
 """Generations of the HGA for each end of a front, at least."""
 
-MOST_DISTURBANCE = 1e6
-"""The weight with which hardly anything but IAE_DIS counts."""
-
 PYMOO_NSGA2 = "pymoo.algorithms.moo.nsga2"
 
 TIME_CONSTANT = 1.0  # s, T
@@ -47,6 +44,9 @@ DEAD_TIMES = 14.0
 
 Loop = float | Case
 """What a front belongs to: a ratio L/T of Figure 6, or a case."""
+
+Costs = Callable[[Array], tuple[Array, Array]]
+"""Of candidates [n, d] both measures [n, 2], and the violations [n]."""
 
 
 @dataclass(frozen=True)
@@ -187,11 +187,9 @@ def pareto_front(
             constraints=constraints,
             threads=threads,
         )
-    asked = TuningProblem.of_case(case, controller, seed=seed, generations=max(LEAST_FOR_ENDS, generations // 4))
+    asked = TuningProblem.of_case(case, controller, seed=seed, generations=max(LEAST_FOR_ENDS, generations))
     problem = replace(asked, constraints=constraints)
     objective, space = Objective(problem, threads), problem.space
-    known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem, threads), *(poorer.gains if poorer else ()))]
-    starts = np.reshape(known, (-1, len(problem.names)))
 
     def costs(candidates: Array) -> tuple[Array, Array]:
         setpoint, disturbance = objective.integrals(candidates)
@@ -199,6 +197,8 @@ def pareto_front(
         measures = np.column_stack([objective_values(*pair, weight=0.0) for pair in pairs])
         return measures, scores(problem, candidates, setpoint, disturbance).violation
 
+    known = [candidate_of(problem, gains)[0] for gains in (*_ends(problem, costs), *(poorer.gains if poorer else ()))]
+    starts = np.reshape(known, (-1, len(problem.names)))
     found = space.at(_nsga2(costs, space, space.of(starts), seed, population, generations))
     candidates = np.unique(np.concatenate([starts, found]), axis=0)
     iae, violation = costs(candidates) if len(candidates) else (np.empty((0, 2)), np.empty(0))
@@ -272,19 +272,24 @@ def fronts_of(
     return fronts
 
 
-def _ends(problem: TuningProblem, threads: int | None) -> list[Gains]:
-    """The gains with the least IAE_SP, and with the least IAE_DIS, that the HGA finds."""
+def _ends(problem: TuningProblem, costs: Costs) -> list[Gains]:
+    """The gains with the least IAE_SP, and with the least IAE_DIS, that the HGA finds among what the front may hold."""
     ends = []
-    for weight in (0.0, MOST_DISTURBANCE):
-        study = Study(replace(problem, weight=weight))
-        study.run(Objective(study.problem, threads))
+    for measure in range(2):
+        study = Study(problem)
+
+        def evaluated(candidates: Array, measure: int = measure) -> Scores:
+            measures, violation = costs(candidates)
+            return Scores(measures[:, measure], violation)
+
+        study.run(evaluated)
         if study.feasible:
             ends.append(study.result.gains)
     return ends
 
 
 def _nsga2(
-    costs: Callable[[Array], tuple[Array, Array]],
+    costs: Costs,
     space: Space,
     starts: Array,
     seed: int,
@@ -294,7 +299,6 @@ def _nsga2(
     """The points [n, d] in 0 .. 1 that NSGA-II ends with.
 
     Args:
-        costs: both measures [n, 2] and the violations [n] of candidates [n, d].
         starts: [k, d] in 0 .. 1; half the population at most begins there.
     """
     nsga2, problems, optimize = (

@@ -14,7 +14,10 @@ from tdof_npid_ros.case import load_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, TUNED, ControllerType
 from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.objective import Objective
 from tdof_npid_ros.tuning.pareto import POORER, Front, dominated_fraction, foptd_case, pareto_front
+from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.study import Study
 
 RATIO = 0.5
 SHORT = ["pareto", "--ratio", "0.5", "--generations", "3"]
@@ -67,6 +70,14 @@ def test_a_controller_is_nowhere_behind_the_one_that_it_contains(kind: Controlle
     richer = pareto_front(0.1, kind, population=16, generations=2, poorer=poorer)
     assert all((richer.iae <= point).all(axis=1).any() for point in poorer.iae)
     assert (richer.iae.min(axis=0) <= poorer.iae.min(axis=0)).all()
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_the_least_iae_of_a_setpoint_lies_far_along_a_valley_beyond_a_rise(seed: int) -> None:
+    problem = TuningProblem(foptd_case(0.1), "tdof_npid1", weight=0.0, seed=seed, generations=200)
+    study = Study(problem)
+    study.run(Objective(problem))
+    assert study.best_value <= 0.1399 and study.result.gains.alpha > 0.7
 
 
 def test_a_weight_moves_the_best_point(fronts: dict[str, Front]) -> None:
