@@ -27,6 +27,8 @@ METHOD = (
 )
 PEERS = ("ros-jazzy-rclpy",)
 NOTES = (
+    "What bounds stopping by itself: a search counts as converged after five rounds, of which two agree. With 40 "
+    "candidates at a time a round takes 8 to 22 generations, so in 60 generations there are three or four.",
     "The whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second "
     "bound it. "
     "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages the "
