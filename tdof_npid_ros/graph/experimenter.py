@@ -22,7 +22,7 @@ from tdof_npid_ros.interruption import afterwards, check
 from tdof_npid_ros.parameters import EXPERIMENT, GAINS
 
 POLL = 0.005  # s
-LEASE = 5.0  # s, of wall time, for a busy machine lets a tool wait a second or two; renewed four times in it
+LEASE = 8.0  # s, of wall time, for a busy machine lets a tool wait for seconds; renewed four times in it
 REST_SAMPLES = 200
 LEAST_REST_SAMPLES = 50
 ATTEMPTS = 3  # to reach a controller that may be busy
