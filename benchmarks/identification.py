@@ -12,6 +12,7 @@ from benchmarks.harness import Result, Table, Verdict, main, plural, seconds, su
 from tdof_npid_ros.case import Case, make_case
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.identification.identify import Identified, identify
+from tdof_npid_ros.identification.result import process_of
 
 TITLE = "Identification"
 METHOD = (
@@ -55,7 +56,7 @@ def run(size: str) -> Result:
         ours = [seconds(lambda record=record: identify([record])) for _ in range(repeats)]  # type: ignore[misc]
         ratios[SHORT].append(min(ours) / _simulation(found))
         result.rates.append(summary(f"{name}, {plural(SHORT, 'sample')}", "s", ours, ours=True))
-        off = _rms(_step_of(_plant(found)) - truth) / float(np.ptp(truth))
+        off = _rms(_step_of(process_of(found).transfer_function()) - truth) / float(np.ptp(truth))
         if not peer:
             rows.append([name, f"{100.0 * off:.2g}", "not installed"])
             continue
@@ -95,14 +96,6 @@ def _record(case: Case, seed: int) -> Stretch:
 def _simulation(found: Identified) -> float:
     """Time to simulate the record once by the model found."""
     return min(seconds(lambda: found.problem.residuals(found.solution)) for _ in range(20))
-
-
-def _plant(found: Identified) -> dict[str, Any]:
-    """The model found as a plant's parameters."""
-    at, numerator = found.solution.point, found.solution.numerator
-    plant = found.structure.transfer_function(at.shape, at.dead_time, numerator)
-    rational = {"numerator": list(plant.numerator), "denominator": list(plant.denominator)}
-    return {"model": "transfer_function", **rational, "dead_time": plant.dead_time}
 
 
 def _rms(values: np.ndarray) -> float:

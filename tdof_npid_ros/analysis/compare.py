@@ -92,9 +92,8 @@ class Comparison:
     first: str = ""
     other_parameters: set[str] = field(default_factory=set)
     failure: str = ""
-    _of_other_parameters: set[EpisodeLabel | None] = field(
-        default_factory=set, init=False
-    )  # episodes with such answers
+    # episodes with such an answer
+    _of_other_parameters: set[EpisodeLabel | None] = field(default_factory=set, init=False)
 
     @property
     def compared(self) -> int:

@@ -281,12 +281,12 @@ class HGA(Optimizer):
         """The scores as this round takes them: what lies where it keeps away from is not allowed."""
         state = self._state
         if state.half:
-            beyond = (state.candidates[:, state.half - 1] < 0.5) == state.upper_half
-            return Scores(told.objective, told.violation + np.where(beyond, OUT_OF_QUESTION, 0.0))
-        if not state.elsewhere:
+            out = (state.candidates[:, state.half - 1] < 0.5) == state.upper_half
+        elif state.elsewhere:
+            out = np.abs(state.candidates[:, None] - state.end_points[None]).max(axis=2).min(axis=1) < KNOWN
+        else:
             return told
-        distances = np.abs(state.candidates[:, None] - state.end_points[None]).max(axis=2).min(axis=1)
-        return Scores(told.objective, told.violation + np.where(distances < KNOWN, OUT_OF_QUESTION, 0.0))
+        return Scores(told.objective, told.violation + np.where(out, OUT_OF_QUESTION, 0.0))
 
     def _half_linear(self, points: Array) -> Array:
         """The points [n, d] in 0 .. 1, every other one of them along linear scales."""

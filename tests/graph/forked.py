@@ -17,6 +17,7 @@ from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from subprocess import TimeoutExpired
 from typing import IO
+from unittest import mock
 
 from tdof_npid_ros.graph.__main__ import run
 
@@ -27,14 +28,9 @@ SERVER.set_forkserver_preload(["loaded"])
 @cache
 def start_server() -> None:
     """Once in a process; the server must find what it loads."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), before or ""])
-    try:
+    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    with mock.patch.dict(os.environ, {"PYTHONPATH": path}):
         ensure_running()
-    finally:
-        del os.environ["PYTHONPATH"]
-        if before is not None:
-            os.environ["PYTHONPATH"] = before
 
 
 class ForkedNode:
