@@ -11,22 +11,23 @@ from benchmarks.tuning import WITHIN
 from tdof_npid_ros.case import Case, make_case
 from tdof_npid_ros.control.gains import CONTROLLER_TYPES, ControllerType
 from tdof_npid_ros.tuning.objective import Objective
-from tdof_npid_ros.tuning.problem import TuningProblem
+from tdof_npid_ros.tuning.problem import GENERATIONS, POPULATION, TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
 TITLE = "The HGA on plants from forums"
 METHOD = (
     "Plants of the kinds that people ask about (heaters with their limits, carts, tanks, unstable ones, zeros on the "
-    "wrong side), each with all four types of controller, from twenty seeds, 4,000 evaluations each. The best known "
-    "value of a row is the least that any of its runs finds, one of SciPy's differential evolution with 12,000 "
-    "evaluations among them, and of the rows whose type is contained in this one."
+    "wrong side), each with all four types of controller, from twenty seeds with the evaluations that `tdof-npid tune` "
+    "has by default (20,000). The best known value of a row is the least that SciPy's differential evolution finds "
+    "with 200,000 evaluations (80 individuals), that the first seed finds with all of its own, and that is known of "
+    "the rows whose type is contained in this one. A later seed ends as soon as it is within 0.1 % of it; should it "
+    "find better than known, then the others are held to that."
 )
 PEERS = ("scipy",)
 NOTES: tuple[str, ...] = ()
 
 SEEDS = range(20)
-POPULATION, GENERATIONS = 40, 100
-DE_POPULATION, DE_GENERATIONS = 80, 150
+DE_POPULATION, DE_GENERATIONS = 80, 2500
 CONTAINED: dict[str, tuple[ControllerType, ...]] = {"tdof_npid1": ("npid",), "tdof_npid2": ("npid", "tdof_npid1")}
 Row = tuple[str, ControllerType]
 LEAST = 1e-4  # lower bounds, as fractions of the upper ones
@@ -89,43 +90,70 @@ def case_of(name: str) -> Case:
 def run(size: str) -> Result:
     """Every loop, type and seed, spread over the cores."""
     full = size == "full"
-    names, seeds, generations = (list(LOOPS), SEEDS, GENERATIONS) if full else (list(LOOPS)[2:3], SEEDS[:1], 3)
+    names, seeds, generations = (list(LOOPS), SEEDS, GENERATIONS) if full else (list(LOOPS)[2:3], SEEDS[:2], 3)
     rows: list[Row] = [(name, controller) for name in names for controller in CONTROLLER_TYPES]
-    work = [(row, "hga", seed, POPULATION, generations) for row in rows for seed in seeds]
-    work += [(row, "de", 0, DE_POPULATION, DE_GENERATIONS if full else 2) for row in rows]
+    first = [Work(row, "hga", seeds[0], POPULATION, generations) for row in rows]
+    peer = [Work(row, "de", 0, DE_POPULATION, DE_GENERATIONS if full else 2) for row in rows]
     with one_process_per_core() as pool:
-        found = list(pool.map(_least_so_far, work, chunksize=4))
-    best: dict[Row, float] = {}
-    for (row, *_), values in zip(work, found, strict=True):
-        best[row] = min(float(values[-1]), best.get(row, np.inf))
-    known = {(name, its): min(best[name, one] for one in (its, *CONTAINED.get(its, ()))) for name, its in rows}
+        whole = dict(zip(first + peer, pool.map(_least_so_far, first + peer), strict=True))
+        known = _known(whole)
+        later = [Work(row, "hga", seed, POPULATION, generations, known[row]) for row in rows for seed in seeds[1:]]
+        found = whole | dict(zip(later, pool.map(_least_so_far, later), strict=True))
+    known = _known(found)
     cells: dict[Row, list[float]] = {row: [] for row in rows}
-    for (row, algorithm, *_), values in zip(work, found, strict=True):
-        if algorithm == "hga":
-            reached = np.flatnonzero(values <= known[row] * WITHIN)
-            cells[row].append(float(reached[0]) + 1.0 if reached.size else np.inf)
-    return _result(names, rows, cells, POPULATION * generations)
+    for work in first + later:
+        reached = np.flatnonzero(found[work] <= known[work.row] * WITHIN)
+        cells[work.row].append(float(reached[0]) + 1.0 if reached.size else np.inf)
+    by_peer = {work.row: float(found[work][-1]) for work in peer}
+    return _result(names, rows, cells, known, by_peer, POPULATION * generations)
 
 
-def _least_so_far(work: tuple[Row, str, int, int, int]) -> np.ndarray:
+class Work(NamedTuple):
+    """One search; `enough`: a value from within 0.1 % of which it may end."""
+
+    row: Row
+    algorithm: str
+    seed: int
+    population: int
+    generations: int
+    enough: float = -np.inf
+
+
+def _known(found: dict[Work, np.ndarray]) -> dict[Row, float]:
+    """The least value of each row that any search has found, in it or in one whose type is contained in its."""
+    best: dict[Row, float] = {}
+    for work, values in found.items():
+        best[work.row] = min(float(values[-1]), best.get(work.row, np.inf))
+    return {(name, its): min(best[name, one] for one in (its, *CONTAINED.get(its, ()))) for name, its in best}
+
+
+def _least_so_far(work: Work) -> np.ndarray:
     """The least value of the first candidate, of the first two, …"""
-    (name, controller), algorithm, seed, population, generations = work
+    name, controller = work.row
     case = case_of(name)
     problem = TuningProblem(
-        case, controller, (), case.weight, algorithm, seed, population=population, generations=generations
+        case, controller, (), case.weight, work.algorithm, work.seed, work.population, work.generations
     )
     study, objective = Study(problem), Objective(problem, threads=1)
     values: list[np.ndarray] = []
-    while not study.done:
+    while not study.done and not (study.feasible and study.best_value <= work.enough * WITHIN):
         scores = objective(study.ask())
         values.append(scores.values)
         study.tell(scores)
     return np.minimum.accumulate(np.concatenate(values))
 
 
-def _result(names: list[str], rows: list[Row], cells: dict[Row, list[float]], budget: int) -> Result:
+def _result(
+    names: list[str],
+    rows: list[Row],
+    cells: dict[Row, list[float]],
+    known: dict[Row, float],
+    by_peer: dict[Row, float],
+    budget: int,
+) -> Result:
     shares = {row: float(np.mean(np.isfinite(cell))) for row, cell in cells.items()}
     least = min(rows, key=lambda row: shares[row])
+    near = [by_peer[row] <= known[row] * WITHIN for row in rows]
     result = Result()
     claim = (
         f"share of the HGA's runs within 0.1 % of the best known, {len(names)} plants, {len(CONTROLLER_TYPES)} types"
@@ -133,6 +161,7 @@ def _result(names: list[str], rows: list[Row], cells: dict[Row, list[float]], bu
     result.verdicts += [
         Verdict(claim, float(np.mean(list(shares.values()))), 0.99),
         Verdict(f"the same on its weakest ({', '.join(least)})", shares[least], None),
+        Verdict("the same of one run of DE with ten times the evaluations", float(np.mean(near)), None),
     ]
     for controller in CONTROLLER_TYPES:
         counts = [min(one, budget) for row in rows if row[1] == controller for one in cells[row]]
@@ -141,7 +170,10 @@ def _result(names: list[str], rows: list[Row], cells: dict[Row, list[float]], bu
     title = (
         "Evaluations until within 0.1 % of the best known, median (worst) of the seeds, and the share that gets there"
     )
-    result.tables.append(Table(title, ["plant", *CONTROLLER_TYPES], table))
+    header = ["plant", *CONTROLLER_TYPES]
+    result.tables.append(Table(title, header, table))
+    table = [[name, *(f"{known[name, controller]:.6g}" for controller in CONTROLLER_TYPES)] for name in names]
+    result.tables.append(Table("Best known objective", header, table))
     return result
 
 
