@@ -161,7 +161,7 @@ def _trial(
     proposal = proposal_of(loop, rest._replace(setpoint=base), wanted, "step")
     _, longest = longest_of(loop, arguments)
     target = base + proposal.size
-    watched = settling_time(design, proposal.size)  # computed before the loop is held, for the lease is short
+    watched = settling_time(design, proposal.size)  # before the loop is held, for it may take some time
     with Hold(loop, "confirm", proposal.safe_output, proposal.safe_effort, longest) as hold:
         hold.apply({**design.settings, "manual": False, "experiment_setpoint": base})
         hold.wait(SETTLES * design.horizon)
@@ -174,9 +174,8 @@ def _trial(
         rows = rows[next((i for i, row in enumerate(rows) if row.setpoint[0] == target), 0) :]
         y, _, r = signals_of(rows)
         times = [row.stamp_ns / 1e9 - rows[0].stamp_ns / 1e9 for row in rows]
-        step = confirmed(
-            design, times, r, y, [float(row.effort[0]) for row in rows], (now.output, now.effort), now.noise
-        )
+        u = [float(row.effort[0]) for row in rows]
+        step = hold.during(lambda: confirmed(design, times, r, y, u, (now.output, now.effort), now.noise))
         work.confirmed = step
         work.records.append(record_of(hold.taken, "confirming step", len(work.records) + 1, loop.effort_limits))
         say(

@@ -6,8 +6,9 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,7 +29,10 @@ LEAST_REST_SAMPLES = 50
 ATTEMPTS = 3  # to reach a controller that may be busy
 FOUND = 1.0  # s until a simulated plant, if there is one, has been found
 SILENCE = 3.0  # s of wall time
+RENEWS = 0.1  # s between two looks whether the lease is to be renewed, while something is computed
 SETTINGS = ("sample_period", "setpoint", "joint_names", *GAIN_NAMES, *OPTION_NAMES, *EXPERIMENT)
+
+_T = TypeVar("_T")
 
 
 class ExperimentError(RuntimeError):
@@ -228,6 +232,18 @@ class Hold:
         check()
         if time.monotonic() > self._renew_at:
             self._set({})
+
+    def during(self, compute: Callable[[], _T]) -> _T:
+        """What `compute` returns, however long it takes: the lease is renewed meanwhile.
+
+        Raises:
+            ExperimentError: the controller has ended the experiment.
+        """
+        with ThreadPoolExecutor(1) as pool:
+            computed = pool.submit(compute)
+            while wait([computed], timeout=RENEWS).not_done:
+                self.renew()
+        return computed.result()
 
     def wait(self, seconds: float) -> None:
         """Let the loop run for so much of its time."""

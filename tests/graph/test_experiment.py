@@ -6,6 +6,7 @@ import math
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -162,3 +163,68 @@ def test_a_recorder_that_has_lost_messages_records_all_the_same() -> None:
     assert not records_to(bag, NodeState(1, "inactive", {}, 0.0))
     assert not records_to(bag, NodeState(0, "recording 3 topics to bag2", {"bag": "bag2"}, 0.0))
     assert records_to(bag, NodeState(1, "5 messages lost, most on /clock: set lossless", {"bag": "bag"}, 0.0))
+
+
+class HeldController:
+    """What an experiment sees of a loop: no answers, and a controller that takes what it is given, or refuses."""
+
+    def __init__(self) -> None:
+        self.given: list[dict[str, Any]] = []
+        self.refusal = ""
+        self.count = 0
+        self.observer = self
+
+    def remote(self, _: str) -> HeldController:
+        return self
+
+    def rows_since(self, first: int) -> tuple[list[Any], int]:
+        return [], first
+
+    def set_parameters(self, values: dict[str, Any]) -> None:
+        from tdof_npid_ros.graph.runtime.parameter_client import RefusedError
+
+        self.given.append(values)
+        if self.refusal:
+            raise RefusedError(f"/controller: {self.refusal}")
+
+
+def test_the_lease_is_renewed_while_something_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tdof_npid_ros.graph import experimenter
+
+    monkeypatch.setattr(experimenter, "LEASE", 0.2)
+    loop: Any = HeldController()
+    renewals: list[int] = []
+    enough = threading.Event()
+
+    def computed() -> str:
+        while len(loop.given) < 5 and not enough.wait(0.01):
+            pass
+        renewals.append(len(loop.given))
+        return "a verdict"
+
+    watchdog = threading.Timer(60.0, enough.set)
+    watchdog.start()
+    with experimenter.Hold(loop, "confirm", (0.0, 2.0), (-5.0, 5.0), 10.0) as hold:
+        assert hold.during(computed) == "a verdict"
+    watchdog.cancel()
+    assert renewals[0] >= 5
+    assert all(values["experiment"] == hold.name for values in loop.given[1:5])
+
+
+def test_what_is_computed_is_not_used_once_the_experiment_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tdof_npid_ros.graph import experimenter
+
+    monkeypatch.setattr(experimenter, "LEASE", 0.2)
+    loop: Any = HeldController()
+    ended = threading.Event()
+
+    def computed() -> str:
+        loop.refusal = "experiment confirm has ended: the output is beyond safe_range.output"
+        ended.wait(0.5)
+        return "a verdict"
+
+    with (
+        pytest.raises(experimenter.ExperimentError, match="has ended"),
+        experimenter.Hold(loop, "confirm", (0.0, 2.0), (-5.0, 5.0), 10.0) as hold,
+    ):
+        hold.during(computed)
