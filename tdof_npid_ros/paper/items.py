@@ -237,14 +237,13 @@ def fronts_figure(name: str) -> Item:
     def build(evaluated: Evaluated) -> Figure:
         points = [(front.ratio, front.controller, *iae) for front in evaluated.fronts for iae in front.iae.tolist()]
         ratio, controller, setpoint, disturbance = (np.array(column) for column in zip(*points, strict=True))
-        codes = np.array([list(CONTROLLER_TITLES).index(one) for one in controller], dtype=np.float64)
         return Figure(
             name,
             "Figure 6: optimal Pareto fronts, K = 1, T = 1 s",
             "Tracking against rejection for three dead times, by NSGA-II: the nearer to the lower left corner the "
-            "better. In the CSV, the controllers 0 to 3 are PID, NPID, TDOF-NPID1 and TDOF-NPID2.",
+            "better.",
             lambda path: figures.draw_fronts(evaluated.fronts, path),
-            {"ratio": ratio, "controller": codes, "iae_setpoint": setpoint, "iae_disturbance": disturbance},
+            {"ratio": ratio, "controller": controller, "iae_setpoint": setpoint, "iae_disturbance": disturbance},
         )
 
     return Item((), build, needs_fronts=True)

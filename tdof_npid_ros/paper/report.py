@@ -86,7 +86,7 @@ class Figure:
     Attributes:
         name: of its files, `figure7`.
         draw: writes the PNG.
-        data: columns by heading, of one length.
+        data: columns by heading, numbers or names, of one length.
     """
 
     name: str
@@ -98,7 +98,8 @@ class Figure:
     def csv(self) -> str:
         """The data as CSV."""
         lines = [",".join(self.data)]
-        lines += [",".join(f"{value:.9g}" for value in row) for row in zip(*self.data.values(), strict=True)]
+        rows = zip(*(column.tolist() for column in self.data.values()), strict=True)
+        lines += [",".join(one if isinstance(one, str) else f"{one:.9g}" for one in row) for row in rows]
         return "\n".join(lines) + "\n"
 
 

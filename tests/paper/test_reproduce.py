@@ -272,6 +272,12 @@ def test_a_table_shows_repeated_keys_once() -> None:
     assert table.shown() == [["a", "x", "+1.2"], ["", "y", "–"]]
 
 
+def test_the_data_of_a_figure_are_numbers_and_names() -> None:
+    columns = {"ratio": np.array([0.1, 1.0]), "controller": np.array(["pid", "npid"])}
+    figure = Figure("f", "F", "", lambda path: None, columns)
+    assert figure.csv() == "ratio,controller\n0.1,pid\n1,npid\n"
+
+
 @pytest.mark.parametrize(
     ("cell", "heading", "text"),
     [
