@@ -10,14 +10,13 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.fields import FieldReader, FieldWriter, parse_fields
 from tdof_npid_ros.control.gains import TUNED, Gains, Lanes, gains_from_mapping
@@ -36,6 +35,9 @@ from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameters import CONTROLLER, EXPERIMENT, GAINS, LARGEST_SIGNAL, OPTIONS, sample_period_in_ns
 from tdof_npid_ros.wire import AnswerLabel, Sample, SignalWriter
 
+if TYPE_CHECKING:
+    from tdof_npid_ros.case import Case
+
 SILENCE_LOOKS = 0.05  # s between two looks whether output has stopped
 DRIVEN_OFF = "driven off: the integral action hardly sees so large an error; see k_of_error and integral_rate"
 
@@ -48,7 +50,7 @@ class ControllerNode(LoopEnd):
         given = self.declare_all(CONTROLLER)
         self.sigma_is_given = "sigma" in self._parameter_overrides
         if not self.sigma_is_given:
-            _check_sigma(given["type"], _of_files(sys.argv))
+            _check_sigma(given["type"], sys.argv)
         self.quiet_parameters.add("manual_effort")
         self.controller = Controller(
             gains_from_mapping(given), sample_period_in_ns(given["sample_period"]), options_from_mapping(given)
@@ -299,7 +301,7 @@ class ControllerNode(LoopEnd):
         gains, _ = self._configured(changes)
         self.session.check_experiment(changes, {**self.values_of(list(EXPERIMENT)), **changes})
         if not self.sigma_is_given and "sigma" not in changes:
-            _check_sigma(gains.type, "")
+            _check_sigma(gains.type)
         if "setpoint" in changes and self.commanded and not self._is_setpoint_of_now(changes["setpoint"]):
             raise ValueError(
                 f"the topic {self.resolve_topic_name('setpoint')} gives the setpoint, now "
@@ -433,12 +435,12 @@ def _short(gain: Lanes) -> str:
     return f"[{shown}]" if len(gain) <= SHOWN_NAMES else f"[{shown} …]"
 
 
-def _check_sigma(type_: str, hint: str) -> None:
+def _check_sigma(type_: str, arguments: Sequence[str] = ()) -> None:
     """Refuse a type that needs sigma where none is given: 1 of the output's unit would be a guess."""
     if type_ != "pid":
         raise ValueError(
             f"type {type_} needs sigma, which is not given: set it to the largest change of the setpoint, in the "
-            f"output's unit{hint}; or take type pid"
+            f"output's unit{_of_files(arguments)}; or take type pid"
         )
 
 
@@ -451,6 +453,8 @@ def _cases_of(arguments: Sequence[str]) -> Iterator[tuple[str, Case]]:
     """The parameter files among a node's arguments that are cases, with a plant."""
     for option, path in pairwise(arguments):
         if option == "--params-file":
+            from tdof_npid_ros.case import load_case  # with all plants, which a controller rarely needs
+
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 yield path, load_case(path)
