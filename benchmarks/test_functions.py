@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.harness import Dots, Result, Table, main, one_process_per_core
 from benchmarks.tuning import BUDGET, Counted, Optimise, TargetReachedError, ask_tell, pymoo
+from tdof_npid_ros.tuning.ask_tell import Scores
 
 TITLE = "The HGA on standard test functions"
 METHOD = (
@@ -138,7 +139,7 @@ def _lowest(work: tuple[str, str, int, int]) -> float:
     warnings.simplefilter("ignore")
     function, lower, upper = FUNCTIONS[function_name]
     lowest = _Lowest(function)
-    objective = Counted(lowest, -np.inf, budget)
+    objective = Counted(lambda x: Scores.allowed(lowest(x)), -np.inf, budget)
     with contextlib.suppress(TargetReachedError):
         OPTIMISERS[name](objective, np.full(DIMENSION, lower), np.full(DIMENSION, upper), seed)
     return lowest.value
