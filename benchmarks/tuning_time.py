@@ -19,15 +19,13 @@ METHOD = (
 )
 PEERS = ("cma", "scipy")
 NOTES = (
-    "On the linear rows a quarter of a run is the HGA's own arithmetic between evaluations; it was half of the run "
-    "before "
-    "its Cholesky factors were compiled. Its polish asks for few candidates at "
-    "a time, which costs more calls and fewer evaluations to the target than DE's whole generations. On the circuit, "
-    "of "
-    "which an episode has 30,000 steps, the evaluations prevail.",
+    "What bounds the ratio: the HGA's polish asks for six candidates at a time, which costs more calls and fewer "
+    "evaluations to the target than DE's whole generations; a block of 16 lanes takes nearly as long as one of 64. "
+    "On the linear rows some 40 % of a run is the loop, 20 % the HGA's own arithmetic, the rest the checks of each "
+    "candidate and its margins. On the circuit, of which an episode has 30,000 steps, the evaluations prevail.",
 )
 
-LIMIT = 3.0  # s
+LIMIT = 4.0
 ALGORITHMS = {"hga": "HGA", "cmaes": "cma", "de": "SciPy DE"}
 
 
@@ -51,15 +49,9 @@ def run(size: str) -> Result:
     for algorithm, name in ALGORITHMS.items():
         result.rates.append(summary(f"{name}, all rows", "s", times[algorithm], ours=algorithm == "hga"))
     labels = [" ".join(row) for row in rows]
-    slowest, row = max(zip(times["hga"], labels, strict=True))
-    cores = available_cores()
-    result.verdicts.append(
-        Verdict(f"full HGA run on {cores} cores, slowest row ({row}), s", slowest, LIMIT, at_most=True)
-    )
     ratio = sum(times["hga"]) / sum(times["de"])
-    result.verdicts.append(
-        Verdict("time of the HGA's runs, times that of SciPy DE's with as many evaluations", ratio, None)
-    )
+    claim = f"time of the HGA's runs on {available_cores()} cores, times that of SciPy DE's with as many evaluations"
+    result.verdicts.append(Verdict(claim, ratio, LIMIT, at_most=True))
     cells = [[f"{times[a][i]:.2f}" for a in ALGORITHMS] for i in range(len(rows))]
     result.tables.append(
         Table("Wall time of 8,000 evaluations, in s", ["row", *ALGORITHMS.values()],

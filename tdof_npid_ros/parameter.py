@@ -139,16 +139,16 @@ class Parameter:
         if is_sequence != self.is_list and not (is_sequence and self.per_lane):
             raise self._error(value)
         if not is_sequence:
-            return self._one(value, value)
+            return self._one(value, value, self.kind)
         if self.length not in (None, len(value)) or (self.per_lane and not len(value)):
             raise self._error(value)
-        values = [self._one(one, value) for one in value]
+        kind = self.kind
+        values = [self._one(one, value, kind) for one in value]
         if self.is_interval and not values[0] < values[1]:
             raise self._error(value)
         return values
 
-    def _one(self, one: Any, whole: Any) -> Any:
-        kind = self.kind
+    def _one(self, one: Any, whole: Any, kind: type) -> Any:
         if kind is float:
             if type(one) is not float:  # the usual case first: there may be thousands
                 one = self._float(one, whole)

@@ -120,7 +120,7 @@ GAIN_NAMES = tuple(field.name for field in fields(Gains))
 
 def gains_from_candidates(base: Gains, names: Sequence[str], candidates: np.ndarray) -> Gains:
     """Gains with one lane per row of `candidates` (lanes, len(names)); what is not named stays as in `base`."""
-    return base.with_values(**{name: tuple(candidates[:, i]) for i, name in enumerate(names)})
+    return base.with_values(**{name: tuple(candidates[:, i].tolist()) for i, name in enumerate(names)})
 
 
 def gains_from_mapping(values: Mapping[str, Any]) -> Gains:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from tdof_npid_ros.case import EPISODES
-from tdof_npid_ros.control.gains import gains_from_candidates
+from tdof_npid_ros.control.gains import Gains, gains_from_candidates
 from tdof_npid_ros.loop import VECTOR, Integrals, joined
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.problem import TuningProblem
@@ -42,7 +42,10 @@ def objective_values(setpoint: Integrals, disturbance: Integrals, weight: float)
 def scores(problem: TuningProblem, candidates: Array, setpoint: Integrals, disturbance: Integrals) -> Scores:
     """The scores of candidates (n, len(problem.names)) with the case's plant, from the integrals of their episodes,
     (n,) each."""
-    gains = gains_from_candidates(problem.base, problem.names, candidates)
+    return _scores(problem, gains_from_candidates(problem.base, problem.names, candidates), setpoint, disturbance)
+
+
+def _scores(problem: TuningProblem, gains: Gains, setpoint: Integrals, disturbance: Integrals) -> Scores:
     return problem.judge(gains, objective_values(setpoint, disturbance, problem.weight), setpoint, disturbance)
 
 
@@ -84,15 +87,18 @@ class Objective:
         """
         if self._problem.perturbed:
             return self._scores_with_plants(candidates)
-        return scores(self._problem, candidates, *self.integrals(candidates))
+        gains = gains_from_candidates(self._problem.base, self._problem.names, candidates)
+        return _scores(self._problem, gains, *self._integrals(candidates, gains))
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
         """Of the setpoint and the disturbance episode with the case's plant, (n,) each."""
-        problem = self._problem
-        blocks = [
-            gains_from_candidates(problem.base, problem.names, candidates[block])
-            for block in _blocks(len(candidates), self._threads)
-        ]
+        return self._integrals(candidates, gains_from_candidates(self._problem.base, self._problem.names, candidates))
+
+    def _integrals(self, candidates: Array, whole: Gains) -> tuple[Integrals, Integrals]:
+        problem, parts = self._problem, _blocks(len(candidates), self._threads)
+        blocks = [whole]  # made once, for that takes as long as a short episode
+        if len(parts) > 1:
+            blocks = [gains_from_candidates(problem.base, problem.names, candidates[part]) for part in parts]
         running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
         setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance

@@ -5,6 +5,8 @@ Only +, -, *, / and sqrt on arrays: BLAS and LAPACK order their sums by the proc
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,7 +51,7 @@ def model_step(points: Array, values: Array, radius: float) -> tuple[Array, Arra
 def _fit(points: Array, values: Array) -> tuple[Array, Array]:
     """Gradient [d] and Hessian [d, d] at 0 of the least-squares quadratic; better points weigh more."""
     count, dimension = points.shape
-    rows, columns = np.triu_indices(dimension)
+    rows, columns = _pairs(dimension)
     terms = np.column_stack([np.ones(count), points, points[:, rows] * points[:, columns]])
     weighted = terms / np.sqrt(1.0 + np.arange(count))[:, None]
     normal = (weighted[:, :, None] * terms[:, None, :]).sum(axis=0)
@@ -58,6 +60,12 @@ def _fit(points: Array, values: Array) -> tuple[Array, Array]:
     hessian = np.zeros((dimension, dimension))
     hessian[rows, columns] = coefficients[1 + dimension :]
     return coefficients[1 : 1 + dimension], hessian + hessian.T
+
+
+@lru_cache
+def _pairs(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The variables of each quadratic term."""
+    return np.triu_indices(dimension)
 
 
 def _trust_region_step(gradient: Array, hessian: Array, radius: float) -> Array:
