@@ -39,6 +39,7 @@ def run(size: str) -> Result:
     """More and more loops."""
     counts, window = ((1, 2, 4, 8, 16), 15.0) if size == "full" else ((1, 2), 3.0)
     cpu, memory, found, missed, rows = [], [], [], 0, []
+    result = Result()
     with _this_machine(), tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         file = Path(folder) / "fleet.yaml"
         file.write_text(
@@ -54,7 +55,11 @@ def run(size: str) -> Result:
                 for node in ("controller", "plant"):
                     loops[-1].start(node)
                 onlooker.watch(number)
-            onlooker.wait_for_answers(count, loops)
+            try:
+                onlooker.wait_for_answers(count, loops)
+            except TimeoutError as error:
+                result.notes.append(str(error))
+                break
             found.append(time.monotonic() - started)
             pids = [pid for loop in loops for pid in loop.pids.values()]
             before, begin = sum(map(processor_seconds, pids)), time.monotonic()
@@ -65,12 +70,14 @@ def run(size: str) -> Result:
             rows.append(
                 [str(count), f"{cpu[-1]:.3f}", f"{memory[-1]:,.0f}", f"{found[-1]:.1f}", f"{outputs}", f"{lost}"]
             )
-    sizes = [float(count) for count in counts]
-    result = Result()
+    sizes = [float(count) for count in counts[: len(found)]]
+    result.verdicts.append(Verdict("loops that all answer", sizes[-1], counts[-1]))
     for name, values in (("processor time", cpu), ("memory", memory)):
         exponent = float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
         goal = 1.1 if name == "processor time" else None
-        result.verdicts.append(Verdict(f"{name} with 1 to {counts[-1]} loops: exponent", exponent, goal, at_most=True))
+        result.verdicts.append(
+            Verdict(f"{name} with 1 to {sizes[-1]:.0f} loops: exponent", exponent, goal, at_most=True)
+        )
     result.verdicts.append(Verdict("outputs without an answer, all loops", missed, 0, at_most=True))
     header = ["loops", "processors used", "memory, MiB", "until all answer, s", "outputs", "unanswered"]
     result.tables.append(Table("Loops of two processes at 20 Hz", header, rows))

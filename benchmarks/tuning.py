@@ -29,8 +29,7 @@ METHOD = (
     "(`python -m tdof_npid_ros.paper.retune`), which `python -m benchmarks.seeds` compares with SciPy's "
     "differential evolution at 80,000. All get our compiled objective, the same bounds "
     "and scales (logarithmic for gains) and 8,000 evaluations, Optuna's "
-    "samplers fewer, as the table says, for the time they take; the HGA runs 20 seeds on every row, the others 10, "
-    "Optuna's 5. "
+    "samplers fewer, as the table says, for the time they take; the HGA runs 20 seeds on every row, the others five. "
     "What may not win (an unstable loop, one that does not come to rest) has a value above all others. "
     "Configurations: the HGA and `cma` as `tdof-npid tune` runs them, told what may not win and why, and the scales of "
     "the gains; the HGA with its polish by a quadratic model, which the paper's has not; "
@@ -46,7 +45,7 @@ NOTES: tuple[str, ...] = ()
 BUDGET = 8000  # evaluations
 WITHIN = 1.001
 SEEDS, PUBLISHED_SEEDS = range(100, 120), range(100, 110)
-PEER_SEEDS, OPTUNA_SEEDS = SEEDS[:10], SEEDS[:5]
+PEER_SEEDS = SEEDS[:5]
 Evaluate = Callable[[np.ndarray], Scores]
 Row = tuple[str, str]  # case and controller
 
@@ -208,7 +207,7 @@ def run(size: str) -> Result:
 
 def _seeds(name: str) -> range:
     """Of an optimiser."""
-    return SEEDS if name == "HGA" else OPTUNA_SEEDS if name.startswith("Optuna") else PEER_SEEDS
+    return SEEDS if name == "HGA" else PEER_SEEDS
 
 
 def _one(work: tuple[str, Row, int, bool]) -> Run:
