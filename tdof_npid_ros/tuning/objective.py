@@ -87,19 +87,23 @@ class Objective:
         """
         if self._problem.perturbed:
             return self._scores_with_plants(candidates)
-        gains = gains_from_candidates(self._problem.base, self._problem.names, candidates)
-        return _scores(self._problem, gains, *self._integrals(candidates, gains))
+        blocks = self._blocks(candidates)
+        whole = blocks[0] if len(blocks) == 1 else self._gains(candidates)  # to make them takes time
+        return _scores(self._problem, whole, *self._integrals(blocks))
 
     def integrals(self, candidates: Array) -> tuple[Integrals, Integrals]:
         """Of the setpoint and the disturbance episode with the case's plant, (n,) each."""
-        return self._integrals(candidates, gains_from_candidates(self._problem.base, self._problem.names, candidates))
+        return self._integrals(self._blocks(candidates))
 
-    def _integrals(self, candidates: Array, whole: Gains) -> tuple[Integrals, Integrals]:
-        problem, parts = self._problem, _blocks(len(candidates), self._threads)
-        blocks = [whole]  # made once, for that takes as long as a short episode
-        if len(parts) > 1:
-            blocks = [gains_from_candidates(problem.base, problem.names, candidates[part]) for part in parts]
-        running = [[self._pool.submit(problem.case.integrals, name, gains) for gains in blocks] for name in EPISODES]
+    def _gains(self, candidates: Array) -> Gains:
+        return gains_from_candidates(self._problem.base, self._problem.names, candidates)
+
+    def _blocks(self, candidates: Array) -> list[Gains]:
+        return [self._gains(candidates[block]) for block in _blocks(len(candidates), self._threads)]
+
+    def _integrals(self, blocks: list[Gains]) -> tuple[Integrals, Integrals]:
+        case = self._problem.case
+        running = [[self._pool.submit(case.integrals, name, gains) for gains in blocks] for name in EPISODES]
         setpoint, disturbance = (joined([block.result() for block in episode]) for episode in running)
         return setpoint, disturbance
 
@@ -113,7 +117,7 @@ class Objective:
         else:
             _ = problem.plants
             parts = list(self._pool.map(scores_with_plants, [problem] * len(chunks), chunks))
-        return judge.together(gains_from_candidates(problem.base, problem.names, candidates), parts)
+        return judge.together(self._gains(candidates), parts)
 
 
 def scores_with_plants(problem: TuningProblem, chunk: tuple[Array, slice]) -> Scores:

@@ -216,11 +216,10 @@ def test_what_is_computed_is_not_used_once_the_experiment_has_ended(monkeypatch:
 
     monkeypatch.setattr(experimenter, "LEASE", 0.2)
     loop: Any = HeldController()
-    ended = threading.Event()
 
     def computed() -> str:
         loop.refusal = "experiment confirm has ended: the output is beyond safe_range.output"
-        ended.wait(0.5)
+        time.sleep(0.5)
         return "a verdict"
 
     with (
