@@ -69,6 +69,7 @@ class NodeProcess:
         self._log = log
         self.expected_status: int | None = 0
         self.stopped = False
+        self._interrupted = False
         self.process: subprocess.Popen[bytes] | ForkedNode
         with log.open("w") as stream:
             if program or fresh:
@@ -95,12 +96,18 @@ class NodeProcess:
         """Whether it has ended though nobody stopped it."""
         return not self.stopped and self.expected_status == 0 and self.process.poll() is not None
 
-    def stop(self, timeout: float = 10.0) -> float:
-        """Ctrl-C; returns after how many seconds the process had ended. One that hangs tells in its log where."""
-        began, self.stopped = time.monotonic(), True
-        if self.process.poll() is None:
+    def interrupt(self) -> None:
+        """Ctrl-C, once: a second one may find Python ending, without its handlers, and kill it."""
+        self.stopped = True
+        if not self._interrupted and self.process.poll() is None:
+            self._interrupted = True
             self.process.send_signal(signal.SIGCONT)
             self.process.send_signal(signal.SIGINT)
+
+    def stop(self, timeout: float = 10.0) -> float:
+        """Ctrl-C; returns after how many seconds the process had ended. One that hangs tells in its log where."""
+        began = time.monotonic()
+        self.interrupt()
         try:
             self.process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -146,9 +153,7 @@ class Graph:
 
     def close(self) -> None:
         for process in self.processes:
-            if process.process.poll() is None:
-                process.process.send_signal(signal.SIGCONT)
-                process.process.send_signal(signal.SIGINT)
+            process.interrupt()
         for process in self.processes:
             process.stop()
         self._executor.remove_node(self.node)
