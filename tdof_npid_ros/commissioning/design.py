@@ -34,7 +34,6 @@ EXPLAINS = 80.0  # per cent, on data not used
 DRAWN = 40  # plants
 ALLOWED = 1.1  # times M_s - 1 asked for: what the worst of the plants drawn may have
 RELAY_AGREES = 1.3  # factor between the gain that a relay tells and the model's
-GENERATIONS = 200  # of a search, at the most: somebody waits
 TIGHTENED = 4  # times that the margin asked of the model is tightened until that holds
 SET = ("type", "kp", "ki", "kd", "alpha", "beta", "sigma")
 
@@ -140,7 +139,6 @@ def designed(
             controller,
             () if controller == "pid" else ("sigma",),
             seed=seed,
-            generations=GENERATIONS,
             constraints=Constraints(ms=asked),
             warm=True,
             until_converged=True,

@@ -296,12 +296,14 @@ def _reason(fit: Fitted, fits: Sequence[Fitted]) -> str:
     simpler = [other for other in others if other.structure.parameters < fit.structure.parameters]
     richer = [other for other in others if other.structure.parameters > fit.structure.parameters]
     if richer:
-        gained = fit.criterion - min(other.criterion for other in richer)
-        text += (
-            f"more parameters gain {gained:.1f} in AICc, which is not worth them"
-            if gained > 0
-            else "more parameters gain nothing in AICc"
-        )
+        best = min(richer, key=lambda other: other.criterion)
+        gained = fit.criterion - best.criterion
+        if gained <= 0.0:
+            text += "more parameters gain nothing in AICc"
+        else:
+            drifts = gained > WORTH and best.is_cancelled
+            why = "by a slow pole that a zero cancels: drift, not the plant" if drifts else "which is not worth them"
+            text += f"more parameters gain {gained:.1f} in AICc, {why}"
     if simpler:
         text += "; " if richer else ""
         text += f"fewer lose {min(other.criterion for other in simpler) - fit.criterion:.0f}"

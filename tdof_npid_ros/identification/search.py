@@ -18,6 +18,7 @@ STARTS = 3  # that are followed to their minimum, for each coefficient of the nu
 LOAD_TIMES = 40  # candidates in a stretch
 LOAD_PARAMETERS = 3  # its size, its time, and one for having looked everywhere
 WORTH = 10.0  # of the criterion: a structure with more parameters must be that much better (Burnham and Anderson 2002)
+CANCELLED = 0.02  # of a step's response: a slow pole that makes less of it, for a zero cancels it, is drift
 RESOLUTION = 1e-7  # of the output's range: residuals below it say nothing
 
 
@@ -38,6 +39,11 @@ class Fitted:
     def structure(self) -> Structure:
         """What was fitted."""
         return self.problem.structure
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether a zero cancels its slow pole: a plant with fewer parameters, which drifts or is not quite linear."""
+        return self.structure.slow_share(self.solution.point.shape, self.solution.numerator) < CANCELLED
 
 
 def fit_all(
@@ -68,7 +74,9 @@ def averaged(stretches: Sequence[Stretch], samples: int) -> list[Stretch]:
 
 
 def chosen(fits: Sequence[Fitted]) -> Fitted:
-    """The one with the fewest parameters of those that the best does not beat by `WORTH`."""
+    """The one with the fewest parameters of those that the best does not beat by `WORTH`; none whose zero cancels its
+    slow pole, if there are others."""
+    fits = [fit for fit in fits if not fit.is_cancelled] or fits
     best = min(fit.criterion for fit in fits)
     return min(
         (fit for fit in fits if fit.criterion <= best + WORTH), key=lambda f: (f.structure.parameters, f.criterion)

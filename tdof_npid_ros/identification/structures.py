@@ -68,8 +68,20 @@ class Structure:
         elif self.shape:
             values["time_constant"] = t
         if self.numerators == 2:
-            values["zero_time_constant"] = float(numerator[1] / numerator[0]) * t
+            values["zero_time_constant"] = self._zero(numerator) * t
         return values | {"dead_time": dead_time}
+
+    def slow_share(self, shape: np.ndarray, numerator: np.ndarray) -> float:
+        """How much of a step's response the slower of two real poles makes, as a fraction of the gain; 1 where there
+        are no two. Next to nothing where a zero cancels it."""
+        if self.shape < 2 or (damping := math.exp(shape[1])) <= 1.0:
+            return 1.0
+        root = math.sqrt(damping**2 - 1.0)
+        return abs(damping + root - self._zero(numerator)) / (2.0 * root)
+
+    def _zero(self, numerator: np.ndarray) -> float:
+        """The zero's time constant in units of the time constant; 0 where there is no zero."""
+        return float(numerator[1] / numerator[0]) if self.numerators == 2 else 0.0
 
     def transfer_function(self, shape: np.ndarray, dead_time: float, numerator: np.ndarray) -> TransferFunction:
         """The plant that the closed loop runs with."""

@@ -21,7 +21,6 @@ from tdof_npid_ros.tuning.problem import TuningProblem
 from tdof_npid_ros.tuning.study import Study
 
 NICE = 10  # how far behind the loop's nodes it stands
-GENERATIONS = 100  # at most: somebody waits
 TOLD_EVERY = 0.2  # s
 
 
@@ -32,9 +31,7 @@ def search(request: Request, tell: Callable[[State], None]) -> Proposal:
         ValueError: the file or its bounds are wrong, or nothing is found; the message says what.
     """
     case = replace(load_case(request.case), gains=request.gains)
-    study = Study(
-        TuningProblem.of_case(case, request.gains.type, warm=True, generations=GENERATIONS, until_converged=True)
-    )
+    study = Study(TuningProblem.of_case(case, request.gains.type, warm=True, until_converged=True))
     told = -TOLD_EVERY
 
     def after_generation(study: Study) -> bool:

@@ -81,9 +81,8 @@ def true_case(file: Path, loop: Loop) -> Case:
 def compared(case: Case, gains: Gains) -> tuple[float, float, float]:
     """Objective and M_s of gains on the true plant, and the best objective at the same M_s asked for."""
     problem = TuningProblem(
-        case, "tdof_npid2", ("sigma",), constraints=Constraints(ms=MS), warm=True, until_converged=True, seed=1,
-        generations=200,
-    )  # fmt: skip
+        case, "tdof_npid2", ("sigma",), constraints=Constraints(ms=MS), warm=True, until_converged=True, seed=1
+    )
     study = Study(replace(problem, case=replace(case, gains=gains)))
     study.run(Objective(problem))
     study.require_feasible()

@@ -131,6 +131,32 @@ def test_what_was_before_a_record_is_not_guessed() -> None:
             assert found.values[name] == pytest.approx(true, rel=0.1)
 
 
+def tank_held_by_a_pi(seed: int) -> Stretch:
+    """A level that runs out with its square root, so that no linear plant explains it; its setpoint up, down, back."""
+    rng = np.random.default_rng(seed)
+    period, level, integral = 0.2, 1.0, 50.0
+    setpoints = 1.0 + 0.0672 * np.repeat([0.0, 1.0, -1.0, 0.0], [10, 600, 600, 240])
+    efforts, outputs = np.empty(len(setpoints)), np.empty(len(setpoints))
+    for k, setpoint in enumerate(setpoints):
+        outputs[k] = level + 0.002 * rng.standard_normal()
+        efforts[k] = 40.0 * (setpoint - outputs[k]) + integral
+        integral += 2.0 * period * (setpoint - outputs[k])
+        for _ in range(20):
+            level += period / 20.0 * (0.01 * efforts[k] - 0.5 * np.sqrt(level))
+    return Stretch(period * np.arange(len(setpoints)), efforts, outputs, False, 50.0, True)
+
+
+def test_a_slow_pole_that_a_zero_cancels_is_not_taken_for_the_plant() -> None:
+    reasons = []
+    for seed in range(2):
+        found = identify([tank_held_by_a_pi(seed)])
+        assert found.structure.name == "first_order"
+        assert found.values["gain"] == pytest.approx(0.04, rel=0.03)
+        assert found.values["time_constant"] == pytest.approx(4.0, rel=0.05)
+        reasons.append(found.reason)
+    assert any("by a slow pole that a zero cancels: drift, not the plant" in reason for reason in reasons)
+
+
 @pytest.mark.parametrize("name", ["p1-c0.5", "p1-c4", "p2-c2", "p2-c5", "p3-c1", "p3-c2"])
 def test_the_paper_s_processes_from_one_step_of_the_setpoint(name: str) -> None:
     case = load_case(name)
