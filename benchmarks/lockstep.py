@@ -44,7 +44,7 @@ def run(size: str) -> Result:
     """Ping-pong and loop in turn, so that both see the same machine."""
     ros_environment(87)
     full = size == "full"
-    rounds, steps, lane_counts = (3, 12_000, (1, 40, 200)) if full else (1, 500, (4,))
+    rounds, steps, lane_counts = (3, 6_000, (1, 40, 200)) if full else (1, 500, (4,))
     result = Result()
     for lanes in lane_counts:
         trips: dict[str, list[float]] = {executor: [] for executor in EXECUTORS}

@@ -12,7 +12,7 @@ from benchmarks.harness import Result, Verdict, main, ros_environment, summary
 
 TITLE = "Recording a loop at full speed"
 METHOD = (
-    "A lockstep episode of Process 1 of 100,000 steps at full speed, after a short one, with and without the "
+    "A lockstep episode of Process 1 of 30,000 steps at full speed, after a short one, with and without the "
     "recorder, in "
     "turn, three times. `lossless`: the loop waits for its log. Every bag is then checked: messages lost by the "
     "recorder's own count and "
@@ -39,7 +39,7 @@ def run(size: str) -> Result:
     from tdof_npid_ros.bag.reader import BagReader
 
     ros_environment(88)
-    rounds, steps = (3, 100_000) if size == "full" else (1, 2_000)
+    rounds, steps = (3, 30_000) if size == "full" else (1, 2_000)
     result = Result()
     variants = VARIANTS if size == "full" else {name: VARIANTS[name] for name in ("unrecorded", "recorded, lossless")}
     speeds: dict[str, list[float]] = {name: [] for name in variants}

@@ -56,7 +56,7 @@ CONTROLLER = [sys.executable, "-m", "tdof_npid_ros.graph", "controller"]
 
 def run(size: str) -> Result:
     """Each several times; what is compared, in turn."""
-    repeats, firsts = (7, 3) if size == "full" else (1, 0)
+    repeats, firsts = (7, 1) if size == "full" else (1, 0)
     simulate = [PROGRAM, "simulate", "p1-c0.5", "--json"]
     first: list[float] = []
     for _ in range(firsts):

@@ -29,7 +29,7 @@ METHOD = (
     "(`python -m tdof_npid_ros.paper.retune`), which `python -m benchmarks.seeds` compares with SciPy's "
     "differential evolution at 80,000. All get our compiled objective, the same bounds "
     "and scales (logarithmic for gains) and 8,000 evaluations, Optuna's "
-    "samplers fewer, as the table says, for the time they take; the HGA runs 20 seeds on every row, the others five. "
+    "samplers fewer, as the table says, for the time they take; the HGA runs 20 seeds on every row, the others three. "
     "What may not win (an unstable loop, one that does not come to rest) has a value above all others. "
     "Configurations: the HGA and `cma` as `tdof-npid tune` runs them, told what may not win and why, and the scales of "
     "the gains; the HGA with its polish by a quadratic model, which the paper's has not; "
@@ -49,7 +49,7 @@ NOTES = (
 BUDGET = 8000  # evaluations
 WITHIN = 1.001
 SEEDS, PUBLISHED_SEEDS = range(100, 120), range(100, 110)
-PEER_SEEDS = SEEDS[:5]
+PEER_SEEDS = SEEDS[:3]
 Evaluate = Callable[[np.ndarray], Scores]
 Row = tuple[str, str]  # case and controller
 
@@ -186,7 +186,7 @@ OPTIMISERS: dict[str, tuple[Optimise, int]] = {  # and their budgets
     "pymoo DE": (pymoo("DE"), BUDGET),
     "pymoo PSO": (pymoo("PSO"), BUDGET),
     "pymoo CMA-ES": (pymoo("CMA-ES"), BUDGET),
-    "Optuna TPE": (_optuna("TPE"), 300),
+    "Optuna TPE": (_optuna("TPE"), 200),
     "Optuna CMA-ES": (_optuna("CMA-ES"), 1000),
 }
 
