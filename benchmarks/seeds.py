@@ -17,8 +17,8 @@ from tdof_npid_ros.tuning.study import Study
 
 TITLE = "The HGA from ten seeds, beside the published optima and 80,000 evaluations of differential evolution"
 METHOD = (
-    "On each of the 18 linear rows, ten HGA runs of 8,000 evaluations (`tdof-npid tune`, seeds 0 to 9) and one of "
-    "SciPy's "
+    "On each of the 18 linear rows, ten HGA runs of 8,000 evaluations (`tdof-npid tune --cold --budget 8000`, seeds 0 "
+    "to 9) and one of SciPy's "
     "`differential_evolution` (`tdof-npid tune --algorithm de`, 80 individuals, 1,000 generations) with ten times as "
     "many. On the four NPID rows of Process 3, whose published objective no search reaches with sigma = 1, both run "
     "with "

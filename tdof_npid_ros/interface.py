@@ -84,7 +84,8 @@ def tune(
     weight: float | None = None,
     **options: Any,
 ) -> TuningResult:
-    """Find the gains with the least IAE_SP + weight · IAE_DIS, equation (10), by the hybrid genetic algorithm.
+    """Find the gains with the least IAE_SP + weight · IAE_DIS, equation (10), by the hybrid genetic algorithm, from
+    random ones, as `tdof-npid tune --cold`.
 
     What the case asks its tuner for holds here, too: its weight, margins (`ms`, …) and what it frees.
 

@@ -34,7 +34,7 @@ EXPLAINS = 80.0  # per cent, on data not used
 DRAWN = 40  # plants
 ALLOWED = 1.1  # times M_s - 1 asked for: what the worst of the plants drawn may have
 RELAY_AGREES = 1.3  # factor between the gain that a relay tells and the model's
-TIGHTENED = 4  # times that the margin asked of the model is tightened until that holds
+TIGHTENED = 4  # searches at the most, each with a tighter margin asked of the model, until that holds
 SET = ("type", "kp", "ki", "kd", "alpha", "beta", "sigma")
 
 

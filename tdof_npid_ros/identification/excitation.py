@@ -247,8 +247,8 @@ class RelayPoint:
 def relay_point(time: np.ndarray, effort: np.ndarray, output: np.ndarray) -> RelayPoint | None:
     """The point that a relay's oscillation tells; None if it has not gone round twice.
 
-    The first period, in which the oscillation builds up, is left out. The effort is the one applied, so whatever delays
-    it on its way to the plant does no harm.
+    The last whole period counts: by then the oscillation has built up. The effort is the one applied, so whatever
+    delays it on its way to the plant does no harm.
 
     Args:
         time: s, (samples,).

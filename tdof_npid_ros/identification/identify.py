@@ -78,7 +78,7 @@ class Identified:
         noise: standard deviation of the residuals, in the output's unit.
         noise_model: the residual is white noise plus these times the residuals before, (lags,).
         residual_correlation: the largest correlation of the white noise with itself at lags 1 to 20.
-        residual_bound: what 99 % of white noises stay below.
+        residual_bound: what this is less than in 99 % of white noises.
         level: the output at which the plant rests with the effort `effort_level`.
         effort_level: the effort before the first stretch; of an integrating plant, the one that holds its output.
         residuals: by stretch, (samples,).
@@ -142,7 +142,7 @@ def identify(stretches: Sequence[Stretch], structures: Sequence[Structure] = tup
         math.sqrt(float(np.mean(np.concatenate([r[s.used] for r, s in zip(residuals, stretches, strict=True)]) ** 2))),
         whitening,
         float(np.max(np.abs(covariance[1:]), initial=0.0) / covariance[0]) if covariance[0] > 0.0 else 0.0,
-        2.58 / math.sqrt(sum(map(len, white))),
+        _bound_of_white_noise(sum(map(len, white)), max(len(covariance) - 1, 1)),
         *_operating_point(final.problem, solution),
         residuals,
         averages,
@@ -336,6 +336,11 @@ def _whitened(residual: np.ndarray, whitening: np.ndarray) -> np.ndarray:
     for lag, coefficient in enumerate(whitening, start=1):
         out -= coefficient * residual[lags - lag : len(residual) - lag]
     return out
+
+
+def _bound_of_white_noise(count: int, lags: int) -> float:
+    """What the largest of so many correlations, each of standard deviation 1/sqrt(count), stays below in 99 %."""
+    return float(stats.norm.isf(0.5 * (1.0 - 0.99 ** (1.0 / lags)))) / math.sqrt(count)
 
 
 def _operating_point(problem: Problem, solution: Solution) -> tuple[float, float]:

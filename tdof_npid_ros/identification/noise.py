@@ -15,7 +15,7 @@ WORTH = 10.0  # of the criterion, for a longer model of the noise
 def autoregression(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """The coefficients of noise[k] = e[k] + sum of c_j noise[k - j], by Yule and Walker; none where it is white.
 
-    The least order wins whose AICc nothing longer betters by more than `WORTH`.
+    The least order wins whose AIC nothing longer betters by more than `WORTH`.
     """
     count = sum(map(len, residuals))
     most = min(MOST_LAGS, count // SAMPLES_PER_LAG)

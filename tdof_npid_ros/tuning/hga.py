@@ -23,7 +23,7 @@ from the best, one for each best. Once another has ended as low, rounds look els
 rounds before is not taken for good.
 
 And a valley may rise and then fall lower, far along it, as those of two-degree-of-freedom loops do along alpha. So
-then, too, or once five rounds are over, every other round stays in the half of one parameter's range in which the best
+then, too, or once six rounds are over, every other round stays in the half of one parameter's range in which the best
 does not lie, each parameter in turn, the last first, and begins about the best in the others.
 
 Half of each random population is drawn along the parameters' scales, half of it linearly: bounds that fit lie about

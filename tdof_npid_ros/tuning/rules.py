@@ -103,7 +103,8 @@ def imc_oscillating(
         period: the inverse of the natural frequency, s (not 2π times it).
         damping: the damping ratio, above 0.
         dead_time, sample_period: s.
-        zero: s; one with inverse response (zero < 0) counts as dead time, another is left alone.
+        zero: s; of either sign it counts as dead time: one with inverse response (zero < 0) delays, another makes the
+            loop livelier than the rule expects.
         closed_loop_time: s, instead of the rule's choice.
 
     Raises:
