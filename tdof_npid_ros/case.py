@@ -18,7 +18,7 @@ from tdof_npid_ros.metrics import DisturbanceMetrics, SetpointMetrics, disturban
 from tdof_npid_ros.one_line import as_text
 from tdof_npid_ros.parameter import Table
 from tdof_npid_ros.parameter_file import ParameterFileError, find_parameter_file, read_parameters
-from tdof_npid_ros.parameters import NODES, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
+from tdof_npid_ros.parameters import NODES, NOISE, PLANT, SAMPLE_PERIOD, WEIGHT, misspelt, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import (
     changeable_parameters,
     effort_limits,
@@ -95,6 +95,22 @@ class Case:
         return one_plant(noiseless(self.plant_at({})))
 
     @cached_property
+    def as_played(self) -> Case:
+        """The case with the plant as its plan leaves it, at the end of the episode `setpoint`, or of the first."""
+        played = self.set_by_plan
+        return replace(self, plant_values={**self.plant_values, **played}) if played else self
+
+    @property
+    def set_by_plan(self) -> dict[str, float]:
+        """What of the plant's parameters the plan has set by then."""
+        return self.usual_signals.segments[-1].plant if self.usual_signals is not None else {}
+
+    @property
+    def usual_signals(self) -> SampledPlan | None:
+        """Of the episode `setpoint`, or of the first; None without episodes."""
+        return self.signals.get("setpoint") or next(iter(self.signals.values()), None)
+
+    @cached_property
     def alone(self) -> list[Case]:
         """The case with each lane's plant alone, where each lane has its own; else the case."""
         values = values_of_lanes(self.model, self.plant_values)
@@ -109,6 +125,10 @@ class Case:
     def noise_bound(self) -> float:
         """How far a measured output is from the plant's at the most, in the output's unit."""
         return largest_noise(self.plant_at({}))
+
+    def noise_bound_at(self, changes: Mapping[str, Any]) -> float:
+        """As `noise_bound`, with some of the plant's parameters changed."""
+        return largest_noise(self.plant_at(changes)) if changes.keys() & NOISE.keys() else self.noise_bound
 
     def plant_at(self, changes: Mapping[str, float]) -> Plant:
         """The plant with some parameters changed; an `EachLane` where each lane has its own."""
@@ -244,10 +264,15 @@ class Case:
         """
         return self.disturbance_metrics(self.response("disturbance", gains).output[:, 0])
 
-    def disturbance_metrics(self, y: np.ndarray) -> DisturbanceMetrics:
-        """Those of an output (steps + 1,) of the episode `disturbance`; raises as `disturbance_response`."""
+    def disturbance_metrics(self, y: np.ndarray, noise_bound: float | None = None) -> DisturbanceMetrics:
+        """Those of an output (steps + 1,) of the episode `disturbance`; raises as `disturbance_response`.
+
+        Args:
+            noise_bound: of the plant whose output it is; None: of the case's.
+        """
         setpoint, _ = self._held("disturbance")
-        if not np.isclose(setpoint, y[0], atol=1e-8 + self.noise_bound):
+        bound = self.noise_bound if noise_bound is None else noise_bound
+        if not np.isclose(setpoint, y[0], atol=1e-8 + bound):
             raise _no_single_step(
                 self, "disturbance", f"the setpoint is {setpoint:g}, but the output begins at {y[0]:g}"
             )

@@ -66,6 +66,7 @@ class Lane:
         disturbance_is_new: likewise.
         seen_late: a change is seen at the first output after it, which may have moved already.
         largest_step: of the setpoint, in the case's scenario: what the recovery band is a fraction of.
+        noise_bound: how far a measured output of a simulated plant is from the plant's at the most.
         turn: of angles, else 0.
     """
 
@@ -79,6 +80,7 @@ class Lane:
     disturbance_is_new: bool = True
     seen_late: bool = False
     largest_step: float | None = None
+    noise_bound: float = 0.0
     turn: float = 0.0
 
 
@@ -165,7 +167,8 @@ def _first_setpoint(lane: Lane, first: int) -> list[_Change]:
     y = lane.output
     before = float(y[first - 1] if lane.seen_late and first > 0 and not np.isnan(y[first - 1]) else y[first])
     size = abs(float(difference(lane.setpoint[first], before, lane.turn)))
-    if np.isnan(size) or (lane.seen_late and size <= CLEAR_OF_NOISE * _noise(y[:first] if first >= PATH_GAP else y)):
+    noise = CLEAR_OF_NOISE * _noise(y[:first] if first >= PATH_GAP else y) if lane.seen_late else lane.noise_bound
+    if np.isnan(size) or size <= noise:
         return []
     return [_Change(first, "setpoint", before)]
 
@@ -220,6 +223,8 @@ def _measured(lane: Lane, change: _Change, last: int) -> Response:
         return Response(change.kind, start_s, end_s, None, None, NO_SETPOINT)
     period, turn = lane.sample_period, lane.turn
     if change.kind == "tracking":
+        if not lane.seen_late and last < len(lane.time) - 1:
+            r = np.append(r[:-1], r[-2])  # the window's last sample is the next change's first
         iae = integral_absolute_error(r, y, period, turn)
         return Response(change.kind, start_s, end_s, None, iae, "no single step")
     metrics: SetpointMetrics | DisturbanceMetrics

@@ -36,6 +36,7 @@ SIGNALS = ("setpoint", "disturbance")
 PLANT = "plant."  # before the names of the plant's parameters
 START = "start"  # the column of a plan that begins at rest; its value is the same at each point
 LONGEST_REST, SHORTEST_REST = 0.2, 0.05  # fractions of an episode: the stretch from which is judged whether it rests
+LEAST_REST = 2  # samples, of which the late half is one
 LARGEST_PLAN = 10_000_000  # samples: beyond it a plan is taken for a mistake
 LONGEST_TIME = 1e9  # s, thirty years: of a plan and of whatever lasts in it
 MOST_VALUES = 150_000  # points times signals, as many as ramps over two minutes at 1 ms make: a plan is one message
@@ -98,12 +99,12 @@ class SampledPlan:
     def rest(self) -> Rest | None:
         """The stretch at the end from which is judged whether a loop comes to rest: at most the last fifth.
 
-        None where signals or plant change up to the end, so that no loop can.
+        None where signals or plant change up to the end, so that no loop can, or where there are too few steps to tell.
         """
         moves = (signal[1:] != signal[:-1] for signal in (self.setpoint, self.disturbance))
         changes = [int(changed[-1]) + 1 for move in moves if (changed := np.flatnonzero(move)).size]
         first = max([*changes, self.segments[-1].first, math.ceil((1.0 - LONGEST_REST) * self.steps)])
-        if self.steps - first < max(SHORTEST_REST * self.steps, 1):
+        if self.steps - first < max(SHORTEST_REST * self.steps, LEAST_REST):
             return None
         return Rest(first, first + (self.steps - first + 1) // 2)
 

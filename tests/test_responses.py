@@ -74,3 +74,18 @@ def test_a_change_at_the_last_sample_has_no_response() -> None:
     setpoint = np.zeros(N)
     setpoint[-1] = 1.0
     assert [r.kind for r in responses(lane(setpoint, np.zeros(N)))] == ["tracking"]
+
+
+def test_noise_on_the_first_output_is_no_step_of_the_setpoint() -> None:
+    noisy = 0.02 * np.random.default_rng(1).standard_normal(N)
+    (response,) = responses(lane(np.zeros(N), noisy, np.ones(N), largest_step=1.0, noise_bound=0.12))
+    assert response.kind == "disturbance"
+    (response,) = responses(lane(np.ones(N), 1.0 - np.exp(-TIME) + noisy, noise_bound=0.12))
+    assert response.kind == "setpoint"
+
+
+def test_a_path_s_error_ends_before_the_step_that_follows() -> None:
+    setpoint = np.clip(TIME, 0.0, 1.0) + np.where(TIME >= 5.0, 2.0, 0.0)
+    tracking, step = responses(lane(setpoint, np.clip(TIME, 0.0, 1.0)))
+    assert (tracking.kind, step.kind) == ("tracking", "setpoint")
+    assert tracking.iae == pytest.approx(0.0, abs=1e-12)

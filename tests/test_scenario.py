@@ -6,6 +6,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from tdof_npid_ros.case import make_case
+from tdof_npid_ros.loop import integrals
 from tdof_npid_ros.scenario import Plan, PlanError, Segment, parse_plan
 
 PERIOD_NS = 100_000_000
@@ -148,3 +150,16 @@ def test_a_plan_that_ends_within_a_ramp_or_sine_samples_its_last_point() -> None
     np.testing.assert_allclose(sine.setpoint, np.sin(np.pi / 2 * np.arange(11) / 10))
     whole = parse_plan(["0 setpoint ramp 1 over 1", "1 end"], PERIOD_NS).sampled(PERIOD_NS)
     assert whole.setpoint[-1] == 1.0
+
+
+@pytest.mark.parametrize("steps", range(1, 30))
+def test_an_episode_of_any_length_is_simulated_and_integrated(steps: int) -> None:
+    for lines in ([f"{steps} end"], [f"{steps - 1} setpoint 2", f"{steps} end"] if steps > 1 else [f"{steps} end"]):
+        plans = {"setpoint": ["0 setpoint 1", *lines], "disturbance": ["0 disturbance 1", *lines]}
+        plant = {"model": "first_order", "gain": 1.0, "time_constant": 5.0}
+        case = make_case(plant, {"type": "pid", "kp": 1.0, "ki": 0.2}, plans, sample_period=1.0)
+        signals = case.signals["setpoint"]
+        found = integrals(case.plant_at, case.gains, signals, case.effort_limits)
+        run = case.simulate("setpoint")
+        error = np.abs(run.setpoint - run.output[:, 0])
+        assert found.iae[0] == pytest.approx(float(error @ signals.weight), rel=1e-12)

@@ -122,6 +122,7 @@ class Episode:
             disturbance_is_new=self.from_rest,
             seen_late=self.plan is None,
             largest_step=self.largest_step,
+            noise_bound=_noise_bound(self.plant) if self.plan is not None else 0.0,
             turn=self.turn[lane],
         )
 

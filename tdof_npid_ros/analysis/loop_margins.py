@@ -22,7 +22,9 @@ def episode_margins(episode: Episode) -> tuple[Margins | None, ...]:
     """
     if "model" not in episode.plant or not episode.gains:
         return (None,) * episode.lanes
-    plant, gains = dict(episode.plant), episode.gains[-1]
+    segments = episode.plan.sampled(episode.sample_period_ns).segments if episode.plan is not None else ()
+    plant = {**episode.plant, **(segments[-1].plant if segments else {})}
+    gains = episode.gains[-1]
     case = Case("", episode.sample_period_ns, str(plant["model"]), plant, effort_limits(plant), gains, {})
     known: dict[tuple[Gains, float, float], Margins] = {}
     return tuple(_margins(episode, case, lane, known) for lane in range(episode.lanes))

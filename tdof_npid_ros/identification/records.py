@@ -18,6 +18,8 @@ from tdof_npid_ros.field_path import FieldPath, Step
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.fit import Stretch
 from tdof_npid_ros.plants.catalog import make_plant
+from tdof_npid_ros.plants.start import plant_at_start
+from tdof_npid_ros.scenario import Plan
 from tdof_npid_ros.wire import JOINT_STATE, EpisodeLabel
 
 LEAST_STRETCH = 10  # samples; shorter ones are left out
@@ -116,7 +118,7 @@ def _records(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
             until = told[part][first]
             effort = np.append(until[1:], until[-1])
         elif loop.effort is not None:
-            effort = _held(loop.effort, key, stamps, receive, period_ns)
+            effort = _held(_during(loop.effort, output, part), key, stamps, receive, period_ns)
         else:
             continue
         plan = loop.plans.get(label.plan) if label is not None else None
@@ -129,18 +131,20 @@ def _records(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
                 effort = effort + signals.disturbance[at]
                 notes.append("the plan's disturbance is added to the effort")
         elif setpoints is not None:
-            setpoint = _held(setpoints, key, stamps, receive, period_ns)
+            setpoint = _held(_during(setpoints, output, part), key, stamps, receive, period_ns)
         else:
             setpoint = np.full(len(stamps), np.nan)
         known = np.isfinite(y) & np.isfinite(effort)
         if np.count_nonzero(known) < LEAST_STRETCH:
             continue
         time = (stamps[known] - stamps[known][0]) / 1e9
-        before, limits = _from_plant(loop, int(receive[0]))
+        before, limits = _from_plant(loop, plan, int(receive[0]))
         at_rest = label is not None and bool(known[0]) and stamps[0] == 0  # else it is met in the middle
-        stretch = Stretch(
-            time, effort[known], y[known], at_rest, before if at_rest else float(effort[known][0]), is_even(time)
-        )
+        if not at_rest:
+            before = float(effort[known][0])
+        elif told is not None and math.isfinite(until[0]):
+            before = float(until[0])
+        stretch = Stretch(time, effort[known], y[known], at_rest, before, is_even(time))
         name = names.get(label.plan, label.plan) if label is not None and label.plan else "recording"
         yield Record(name, number, stretch, setpoint[known], limits, tuple(note for note in notes if note))
 
@@ -186,6 +190,15 @@ def _applied(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
     return values, "the effort is the output's own, as it was applied"
 
 
+def _during(track: Track, output: Track, part: slice) -> Track:
+    """What arrived while a part of the outputs did, where their stamps go back and so mean several times; else all."""
+    if not (np.diff(output.stamp_ns) < 0).any():
+        return track
+    until = output.receive_ns[part.stop] if part.stop < len(output) else np.iinfo(np.int64).max
+    of_part = (track.receive_ns >= output.receive_ns[part.start]) & (track.receive_ns < until)
+    return track.only(np.flatnonzero(of_part))
+
+
 def _held(track: Track, key: Key, stamps: np.ndarray, receive: np.ndarray, period_ns: float) -> np.ndarray:
     """What holds from each output on, as near as half a sample: by the stamps where both have them, else as
     received."""
@@ -202,13 +215,16 @@ def _held(track: Track, key: Key, stamps: np.ndarray, receive: np.ndarray, perio
     return np.where(at >= 0, values[order][np.maximum(at, 0)], np.nan)
 
 
-def _from_plant(loop: ObservedLoop, time_ns: int) -> tuple[float, tuple[float, float]]:
-    """The effort before an episode and its limits, as far as a simulated plant's parameters tell."""
+def _from_plant(loop: ObservedLoop, plan: Plan | None, time_ns: int) -> tuple[float, tuple[float, float]]:
+    """The effort before an episode and its limits, as far as a simulated plant's parameters and its plan tell."""
     if loop.plant is None:
         return 0.0, (-math.inf, math.inf)
     values = loop.plant.at(time_ns)
     limits = (float(values.get("effort_min", -math.inf)), float(values.get("effort_max", math.inf)))
     try:
-        return float(make_plant(str(values["model"]), values).initial_effort), limits
+        changes = plan.plant_changes(0) if plan is not None else {}
+        start = plan.start if plan is not None else None
+        plant = plant_at_start(lambda at: make_plant(str(values["model"]), {**values, **at}), start, changes, limits)
+        return float(plant.initial_effort), limits
     except ValueError:
         return 0.0, limits

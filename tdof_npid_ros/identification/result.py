@@ -94,7 +94,8 @@ def _settled(value: float, found: Identified, effort: bool = False) -> float:
 def _largest_step(records: Sequence[Record]) -> float:
     """The largest change of the setpoint; of the output, where no setpoint is known or moves."""
     steps = [
-        np.diff(r.setpoint[np.isfinite(r.setpoint)], prepend=0.0 if r.stretch.at_rest else np.nan) for r in records
+        np.diff(r.setpoint[np.isfinite(r.setpoint)], prepend=r.stretch.output[0] if r.stretch.at_rest else np.nan)
+        for r in records
     ]
     sizes = np.abs(np.concatenate(steps))
     sizes = sizes[np.isfinite(sizes)]

@@ -76,6 +76,7 @@ def measured(sweep: Sweep, chunk: Chunk) -> dict[str, np.ndarray]:
     found = {name: np.full(len(changes), np.inf) for name in METRICS}
     fans = max(0, min(len(changes), FAN_LANES - chunk.first))
     diverged = np.zeros(len(changes), dtype=bool)
+    noise_bounds = [case.noise_bound_at(changed) for changed in changes]
     for episode in EPISODES:
         plants = case.lane_plants(episode, changes)
         shown = shown_samples(case.signals[episode].steps)
@@ -87,7 +88,7 @@ def measured(sweep: Sweep, chunk: Chunk) -> dict[str, np.ndarray]:
                 if not np.abs(y).max() < LARGEST_OUTPUT:
                     diverged[j] = True
                     continue
-                for name, value in _metrics(case, episode, y):
+                for name, value in _metrics(case, episode, y, noise_bounds[j]):
                     found[name][j] = np.inf if value is None else value
             kept = max(0, min(fans - first, len(output)))
             fan[:, first : first + kept] = output[:kept, shown].T
@@ -120,7 +121,7 @@ def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
 
 
-def _metrics(case: Case, episode: str, output: np.ndarray) -> list[tuple[str, Any]]:
+def _metrics(case: Case, episode: str, output: np.ndarray, noise_bound: float) -> list[tuple[str, Any]]:
     if episode == "setpoint":
         step = case.setpoint_metrics(output)
         return [
@@ -128,7 +129,7 @@ def _metrics(case: Case, episode: str, output: np.ndarray) -> list[tuple[str, An
             ("settling_time_s", step.settling_time_s),
             ("iae_setpoint", step.iae),
         ]
-    pushed = case.disturbance_metrics(output)
+    pushed = case.disturbance_metrics(output, noise_bound)
     return [
         ("peak", pushed.peak),
         ("recovery_time_s", pushed.recovery_time_s),

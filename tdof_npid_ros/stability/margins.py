@@ -129,10 +129,11 @@ def linear_margins(plant: PulseTransfer, gains: Gains) -> Margins:
     """
     screened = Screen(plant)(gains)
     loop = characteristic(plant, gains)
-    if not any(loop.numerator):
+    if not any(plant.b):
         return Margins(None, "the effort does not move the output at this point")
     h, stable = plant.sample_period, bool(screened.stable[0])
-    beyond = loop.radius(math.expm1(-h / float(screened.time_constant[0])) if stable else None)
+    slow = float(screened.time_constant[0])  # s; 0: all modes are over within a sample
+    beyond = loop.radius(math.expm1(-h / slow) if stable and slow > 0.0 else None)
     time_constant = -h / math.log1p(beyond) if abs(beyond) > ON_BORDER else None
     if not stable or beyond >= -ON_BORDER:
         return Margins(False, _unstable(beyond, h), spectral_radius=1.0 + beyond, time_constant_s=time_constant)
@@ -180,6 +181,9 @@ def _unstable(beyond: float, h: float) -> str:
 def _notes(case: Case, gains: Gains, point: OperatingPoint) -> list[str]:
     """What the numbers leave out."""
     options, notes = case.options, []
+    if case.set_by_plan:
+        told = ", ".join(f"{name} = {value:g}" for name, value in case.set_by_plan.items())
+        notes.append(f"the plant is as the plan leaves it: {told}")
     if not point.linear:
         notes.append(
             f"the plant is linearised where y = {point.output:g}, u = {point.effort:g}, d = {point.disturbance:g}; "

@@ -54,6 +54,7 @@ def operating_point(
     Raises:
         StabilityError: nothing rests there, for a nonlinear plant.
     """
+    case = case.as_played
     r, d = (
         told if told is not None else usual for told, usual in zip((setpoint, disturbance), _usual(case), strict=True)
     )
@@ -84,6 +85,7 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
         >>> loop_plant(load_case("p1-c4")).lag
         401
     """
+    case = case.as_played
     plant, h = case.plant, case.sample_period
     sampled = plant.sampled(case.sample_period_ns)
     if isinstance(sampled, SampledLinear | SampledOffset):
@@ -106,7 +108,7 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
 
 def linear_loop_plants(case: Case, changes: Sequence[Mapping[str, Any]]) -> list[PulseTransfer]:
     """`loop_plant` of a case with a linear plant, for each set of changed parameters."""
-    plants = [noiseless(case.plant_at(changed)) for changed in changes]
+    plants = [noiseless(case.plant_at({**changed, **case.set_by_plan})) for changed in changes]
     linear = [plant for plant in plants if isinstance(plant, TransferFunction)]
     assert len(linear) == len(plants)
     return [_linear(case, sampled) for sampled in sampled_lanes(linear, case.sample_period_ns)]
@@ -119,7 +121,7 @@ def _linear(case: Case, sampled: SampledLinear | SampledOffset) -> PulseTransfer
 
 def _usual(case: Case) -> tuple[float, float]:
     """Setpoint and disturbance at the end of the episode `setpoint`, or of the first; zeros without episodes."""
-    signals = case.signals.get("setpoint") or next(iter(case.signals.values()), None)
+    signals = case.usual_signals
     return (float(signals.setpoint[-1]), float(signals.disturbance[-1])) if signals else (0.0, 0.0)
 
 

@@ -597,6 +597,8 @@ def _screen_lanes(response: Any, kp: Any, ki_h: Any, kd_h: Any, phi: Any, modes_
             finished = last == zeros
             if n.real * d.real < 0.0:
                 _gain(margins, lane, -n.real / d.real)
+            if outside_before:  # |L| >= 1 at half the sampling frequency, too: one more sample turns it about -1
+                margins[_DELAY, lane] = min(margins[_DELAY, lane], 1.0)
         if not (finished and sure):
             margins[_STABLE + 1 :, lane] = np.nan
             continue

@@ -196,7 +196,13 @@ class TuningProblem:
             0.0 if episode in self.restless else self.case.signals[episode].steps * self.case.sample_period
             for episode in EPISODES
         )
-        return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight, self.case.noise_bound)
+        return Judge(self.screen, self.constraints, (setpoint, disturbance), self.weight, self._noise_bound)
+
+    @property
+    def _noise_bound(self) -> float:
+        """The largest of the case's plant and of those near it."""
+        changes = self.perturbed.changes(self.case) if self.perturbed else []
+        return max([self.case.noise_bound, *map(self.case.noise_bound_at, changes)])
 
     @cached_property
     def plants_judge(self) -> PlantsJudge:

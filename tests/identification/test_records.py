@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tdof_npid_ros.analysis.sources import Chosen
+from tdof_npid_ros.analysis.sources import NOTHING_CHOSEN, Chosen
+from tdof_npid_ros.case import Case, make_case
 from tdof_npid_ros.identification import IdentificationError
 from tdof_npid_ros.identification.identify import Identified, identify
 from tdof_npid_ros.identification.records import Record, read_records
+from tdof_npid_ros.identification.result import draft_of
 from tdof_npid_ros.identification.structures import STRUCTURES
 from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.simulator import PlantSimulator
@@ -30,6 +32,7 @@ from foreign_bags import (
     joints,
     write,
 )
+from loop_bags import LoopBag
 
 GAIN, TIME_CONSTANT, DEAD_TIME = 3.0, 0.2, 0.035
 SAMPLES = 600
@@ -108,3 +111,45 @@ def test_a_bag_without_an_effort_is_refused(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", [(k * H_NS, "/temperature", FLOAT64, float64(y)) for k, y in enumerate(output)])
     with pytest.raises(IdentificationError, match="choose it with --effort"):
         read_records([bag], chosen=Chosen.read("/temperature:data", None, None))
+
+
+def started(folder: Path) -> tuple[Case, Path]:
+    """A bag of two episodes that begin at rest where the plan starts, far from where the file does."""
+    plant = {"model": "first_order", "gain": GAIN, "time_constant": TIME_CONSTANT, "dead_time": DEAD_TIME}
+    plans = {
+        "setpoint": ["0 start 30", "0 setpoint 31", "3 end"],
+        "disturbance": ["0 start 60", "0 setpoint 60", "0 disturbance 2", "3 end"],
+    }
+    case = make_case(plant, {"type": "pid", "kp": 0.5, "ki": 2.0}, plans, sample_period=0.01)
+    with LoopBag(folder) as bag:
+        bag.configuration(case, case.gains)
+        for number, name in enumerate(plans, 1):
+            bag.episode(case, case.gains, name, number)
+    return case, folder
+
+
+def test_the_effort_before_an_episode_is_that_of_where_it_starts(tmp_path: Path) -> None:
+    _, bag = started(tmp_path / "bag")
+    for chosen in (NOTHING_CHOSEN, Chosen.read(None, None, "/control_effort:effort[0]")):
+        records = read_records([bag], chosen=chosen)
+        assert [record.stretch.before for record in records] == pytest.approx([10.0, 20.0])
+        found = identify([record.stretch for record in records])
+        assert found.structure.name == "first_order" and not found.loads
+        assert found.values["gain"] == pytest.approx(GAIN, rel=1e-3)
+        assert found.values["dead_time"] == pytest.approx(DEAD_TIME, abs=1e-3)
+
+
+def test_a_chosen_effort_is_that_of_the_same_episode(tmp_path: Path) -> None:
+    case, bag = started(tmp_path / "bag")
+    records = read_records([bag], chosen=Chosen.read(None, None, "/control_effort:effort[0]"))
+    for record, name in zip(records, case.episodes, strict=True):
+        run = case.simulate(name)
+        asked = run.control_effort[:, 0] + case.signals[name].disturbance
+        np.testing.assert_allclose(record.stretch.effort, asked, rtol=1e-12)
+
+
+def test_an_operating_point_is_no_step_of_the_setpoint(tmp_path: Path) -> None:
+    _, bag = started(tmp_path / "bag")
+    records = read_records([bag])
+    draft = draft_of(identify([record.stretch for record in records]), records, "a tank")
+    assert draft.step == pytest.approx(1.0, rel=0.01)

@@ -170,3 +170,10 @@ def test_sensitivity_finds_what_a_metric_depends_on() -> None:
     assert sum(one.explained for one in found.values()) < 1.1
     flat = robust(small(), ["gain 20 %", "dead_time 0.4999 .. 0.5001"], samples=400).sensitivity("peak")
     assert flat["dead_time"].explained < 0.05 and flat["gain"].explained > 0.9
+
+
+def test_noise_may_have_a_spread() -> None:
+    case = load_case("p1-c0.5")
+    found = robust(case, ["noise 0 .. 0.01"], samples=20)
+    assert found.unstable_fraction == 0.0
+    assert np.isfinite(found.metrics["iae_disturbance"]).all()

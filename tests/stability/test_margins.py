@@ -14,7 +14,7 @@ import pytest
 from loops import Loop, closed_loop_matrix, random_loop
 
 from tdof_npid_ros import loop as closed_loop
-from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.case import Case, load_case, make_case
 from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.control.law import KD_H, KI_H, KP, PHI, coefficients
@@ -25,7 +25,7 @@ from tdof_npid_ros.scenario import parse_plan
 from tdof_npid_ros.stability import StabilityError
 from tdof_npid_ros.stability.characteristic import characteristic
 from tdof_npid_ros.stability.margins import linear_margins, margins
-from tdof_npid_ros.stability.plant import loop_plant, operating_point
+from tdof_npid_ros.stability.plant import linear_loop_plants, loop_plant, operating_point
 from tdof_npid_ros.stability.pulse import pulse_transfer
 
 MOST_DELAY = 300  # samples: of what is compared with eigenvalues
@@ -151,8 +151,9 @@ def test_an_unstable_plant_needs_a_gain_within_two_margins() -> None:
 
 def test_a_loop_without_feedback_has_the_plant_s_own_stability() -> None:
     case = case_of(FIRST_ORDER, Gains("pid", 0.0))
-    found = margins(case, case.gains)
-    assert found.stable is None and "does not move" in str(found.reason)
+    assert margins(case, case.gains).stable
+    unstable = {"model": "transfer_function", "numerator": [1.0], "denominator": [1.0, -1.0]}
+    assert margins(case_of(unstable, case.gains), case.gains).stable is False
     pure_integral = margins(case, Gains("pid", 0.0, 0.5))
     assert pure_integral.stable and pure_integral.gain_margin is not None
 
@@ -250,3 +251,32 @@ def test_a_mode_so_near_the_border_that_nobody_can_tell_is_not_called_stable() -
 def test_the_setpoint_s_own_limits_move_the_operating_point() -> None:
     case = case_of(FIRST_ORDER, Gains("pid", 1.0, 1.0), setpoint_max=0.5)
     assert operating_point(case, case.gains, 2.0, 0.0).output == 0.5
+
+
+def test_modes_that_are_over_within_a_sample_are_no_error() -> None:
+    plant = {"model": "first_order", "time_constant": 1e-3}
+    for gains in (Gains("pid", 0.05), Gains("pid", 0.0)):
+        found = margins(case_of(plant, gains), gains)
+        assert found.stable and found.time_constant_s is not None and found.time_constant_s < 0.01
+
+
+def test_a_loop_above_one_at_half_the_sampling_frequency_does_not_bear_one_more_sample() -> None:
+    plant = {"model": "first_order", "time_constant": 0.1, "dead_time": 1.0}
+    gains = Gains("pid", 0.2, 0.0, 0.5)
+    case = replace(case_of(plant, gains), sample_period_ns=1_000_000_000)
+    found = margins(case, gains)
+    assert found.stable and found.delay_margin_samples is not None and found.delay_margin_samples <= 1.0
+    later = replace(case, plant_values={**plant, "dead_time": 2.0})
+    assert margins(later, gains).stable is False
+
+
+def test_margins_are_of_the_plant_as_the_plan_leaves_it() -> None:
+    plans = {name: [f"0 {name} 1", "0 plant.gain 3", "25 end"] for name in ("setpoint", "disturbance")}
+    controller = {"type": "pid", "kp": 2.0, "ki": 1.0}
+    played = make_case({"model": "first_order", "gain": 1.0, "dead_time": 0.1}, controller, plans)
+    plain = make_case({"model": "first_order", "gain": 3.0, "dead_time": 0.1}, controller, {})
+    found, expected = margins(played, played.gains), margins(plain, plain.gains)
+    assert (found.m_s, found.gain_margin) == (expected.m_s, expected.gain_margin)
+    assert "the plant is as the plan leaves it: gain = 3" in found.notes
+    (of_sweep,) = linear_loop_plants(played, [{"gain": 1.1}])
+    assert of_sweep == loop_plant(plain)
