@@ -254,7 +254,7 @@ def test_the_setpoint_s_own_limits_move_the_operating_point() -> None:
 
 
 def test_modes_that_are_over_within_a_sample_are_no_error() -> None:
-    plant = {"model": "first_order", "time_constant": 1e-3}
+    plant = {"model": "first_order", "time_constant": 1e-3, "dead_time": 0.0}
     for gains in (Gains("pid", 0.05), Gains("pid", 0.0)):
         found = margins(case_of(plant, gains), gains)
         assert found.stable and found.time_constant_s is not None and found.time_constant_s < 0.01
