@@ -15,13 +15,14 @@ import numpy as np
 from tdof_npid_ros.parameters import EXPERIMENT, GAINS, LARGEST_SIGNAL, OPTIONS
 
 NOT_MOVED: Final = math.inf  # of `experiment_setpoint` and `experiment_effort`
-RESTORED: Final = frozenset((*GAINS, *OPTIONS))  # as they were before, whatever ends the experiment
-MOVES: Final = EXPERIMENT.keys() - {"experiment"}  # may be set during the experiment by whoever makes it
 AT_REST: Final[dict[str, Any]] = {
     "experiment": "",
     "experiment_setpoint": NOT_MOVED,
     "experiment_effort": NOT_MOVED,
 }
+OPERATORS: Final = frozenset((*GAINS, *OPTIONS))  # whoever else changes them ends the experiment
+LIMITS: Final = tuple(name for name in EXPERIMENT if name not in AT_REST)  # what ends it by itself
+RESTORED: Final = (*GAINS, *OPTIONS, *LIMITS)  # as they were before, whatever ends the experiment
 MODE: Final = ("manual", "manual_effort")
 
 
@@ -72,7 +73,7 @@ class Guard:
         """Whether they leave the experiment the loop: they bear its name, or are none that matter."""
         if "experiment" in changes:
             return bool(changes["experiment"])  # another name is refused
-        return not changes.keys() & (RESTORED | {"setpoint"})
+        return not changes.keys() & (OPERATORS | {"setpoint"})
 
     @staticmethod
     def _mode(effort: float | None, before: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,12 +138,14 @@ class Guard:
             self.name, self._before, self.integral = name, self._now, integral.copy()
             self._answers, self._seen, self._output_ns, self._breach = 0, 0, now_ns, ""
         elif self.name and not name:
-            kept = sorted(n for n in RESTORED & changes.keys() if changes[n] != self._before[n])
+            kept = sorted(n for n in OPERATORS & changes.keys() if changes[n] != self._before[n])
             moved = self.setpoint is not None or any(self._now[n] != self._before[n] for n in MODE)
             goes_back = bool(self._breach) or (moved and not kept)
             self.why = self._breach or (f"{', '.join(kept)} set" if kept else "it was asked to end")
             self.ended, self.name, self.setpoint, self._breach = self.name, "", None, ""
             return goes_back
+        elif self.name and "experiment" not in changes:  # not the experiment's own, so they stay
+            self._before = {**self._before, **{n: changes[n] for n in LIMITS if n in changes}}
         if self.name and changes.keys() & EXPERIMENT.keys():
             self._renewed_ns = now_ns
             self._settings = dict(settings)

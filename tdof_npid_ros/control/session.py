@@ -291,6 +291,11 @@ class Session:
         """Of the latest output that was answered."""
         return self.sequence.latest and self.sequence.latest.stamp_ns
 
+    @property
+    def integral(self) -> np.ndarray | None:
+        """The integral action that the loop goes on with, (lanes,): after an experiment, that of before it."""
+        return self.saved_integral if self._goes_back or self.controller.stamp_ns is None else self.controller.integral
+
     def set_setpoint(self, setpoint: np.ndarray) -> None:
         """Take this setpoint, (1,) or (lanes,), for outputs without a plan.
 

@@ -20,6 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.fields import FieldReader, FieldWriter, parse_fields
 from tdof_npid_ros.control.gains import TUNED, Gains, Lanes, gains_from_mapping
+from tdof_npid_ros.control.guard import RESTORED
 from tdof_npid_ros.control.joints import SHOWN_NAMES, Joints
 from tdof_npid_ros.control.law import TERMS
 from tdof_npid_ros.control.options import ControllerOptions, options_from_mapping
@@ -48,8 +49,9 @@ class ControllerNode(LoopEnd):
     def __init__(self) -> None:
         super().__init__("controller")
         given = self.declare_all(CONTROLLER)
-        self.sigma_is_given = "sigma" in self._parameter_overrides
-        if not self.sigma_is_given:
+        self.gives_sigma = "sigma" in self._parameter_overrides  # the change that is made now, by itself
+        self.sigma_given_in = "" if self.gives_sigma else None  # an experiment; "": for good; None: it is a guess
+        if not self.gives_sigma:
             _check_sigma(given["type"], sys.argv)
         self.quiet_parameters.add("manual_effort")
         self.controller = Controller(
@@ -142,10 +144,8 @@ class ControllerNode(LoopEnd):
         """Keep what outlasts an inactive time."""
         if self.session.guard.name:
             self._end_experiment("the controller was deactivated")
-        if not self.values_of(["save_i_term"])["save_i_term"]:
-            self.session.saved_integral = None
-        elif self.controller.stamp_ns is not None:
-            self.session.saved_integral = self.controller.integral
+        saves = self.values_of(["save_i_term"])["save_i_term"]
+        self.session.saved_integral = self.session.integral if saves else None
 
     # What arrives
 
@@ -292,15 +292,16 @@ class ControllerNode(LoopEnd):
 
     def completed(self, changes: dict[str, Any]) -> dict[str, Any]:
         """With what an experiment sets or restores together with them."""
+        self.gives_sigma = "sigma" in changes
         if not self.session.guard.name and not changes.get("experiment"):
             return changes
-        return self.session.guard.completed(changes, self.values_of([*GAINS, *OPTIONS]))
+        return self.session.guard.completed(changes, self.values_of(RESTORED))
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
         gains, _ = self._configured(changes)
         self.session.check_experiment(changes, {**self.values_of(list(EXPERIMENT)), **changes})
-        if not self.sigma_is_given and "sigma" not in changes:
+        if self._sigma_given_in(changes) is None:
             _check_sigma(gains.type)
         if "setpoint" in changes and self.commanded and not self._is_setpoint_of_now(changes["setpoint"]):
             raise ValueError(
@@ -317,7 +318,7 @@ class ControllerNode(LoopEnd):
 
     def changed(self, changes: dict[str, Any]) -> None:
         """Take over accepted changes."""
-        self.sigma_is_given |= "sigma" in changes
+        self.sigma_given_in = self._sigma_given_in(changes)
         if changes.keys() & (GAINS.keys() | OPTIONS.keys()):
             self.controller.change(*self._configured(changes))
         if "setpoint" in changes and self.commanded:
@@ -328,6 +329,13 @@ class ControllerNode(LoopEnd):
             self.session.timeout_ns = patience_ns(changes["output_timeout"], self.controller.sample_period_ns)
         if "experiment" in changes or self.session.guard.name:
             self._take_experiment(changes)
+
+    def _sigma_given_in(self, changes: dict[str, Any]) -> str | None:
+        """As the attribute will be. What an experiment's end restores is not given by that."""
+        experiment = changes.get("experiment", self.session.guard.name)
+        if self.gives_sigma and self.sigma_given_in != "":
+            return str(experiment)
+        return self.sigma_given_in if self.sigma_given_in in ("", experiment) else None
 
     def _take_experiment(self, changes: dict[str, Any]) -> None:
         guard, had = self.session.guard, self.session.guard.name

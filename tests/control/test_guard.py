@@ -11,7 +11,7 @@ import pytest
 
 from tdof_npid_ros.control.controller import Controller
 from tdof_npid_ros.control.gains import gains_from_mapping
-from tdof_npid_ros.control.guard import Guard
+from tdof_npid_ros.control.guard import RESTORED, Guard
 from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.control.options import options_from_mapping
 from tdof_npid_ros.control.session import Outcome, Session
@@ -46,7 +46,7 @@ class Loop:
 
     def set(self, changes: Mapping[str, Any]) -> None:
         session = self.session
-        changes = session.guard.completed(changes, {name: self.values[name] for name in (*GAINS, *OPTIONS)})
+        changes = session.guard.completed(changes, {name: self.values[name] for name in RESTORED})
         session.check_experiment(changes, {name: changes.get(name, self.values[name]) for name in EXPERIMENT})
         self.values |= changes
         session.controller.change(self._gains(), self._options())
@@ -77,8 +77,7 @@ class Loop:
         return float(outcome.answer.effort[0])
 
     def all_is_as_before(self, before: Mapping[str, Any]) -> bool:
-        settings = {name: self.values[name] for name in (*SAFE, "experiment_duration")}
-        return self.values == {**before, **settings} and self.session.guard.setpoint is None
+        return self.values == before and self.session.guard.setpoint is None
 
 
 def at_rest(**values: Any) -> Loop:
@@ -173,7 +172,15 @@ def test_setting_any_of_its_parameters_renews_the_lease() -> None:
 
 
 @pytest.mark.parametrize(
-    "takes_over", [{"experiment": ""}, {"kp": 3.0}, {"manual": True}, {"setpoint": 1.0}, {"filter_time": 0.1}]
+    "takes_over",
+    [
+        {"experiment": ""},
+        {"experiment": "", "safe_range.output": [-1.5, 1.5]},
+        {"kp": 3.0},
+        {"manual": True},
+        {"setpoint": 1.0},
+        {"filter_time": 0.1},
+    ],
 )
 @pytest.mark.parametrize("move", MOVES)
 def test_what_an_operator_sets_stays_and_all_else_is_restored(takes_over: dict[str, Any], move: str) -> None:
@@ -185,6 +192,33 @@ def test_what_an_operator_sets_stays_and_all_else_is_restored(takes_over: dict[s
     assert loop.all_is_as_before({**before, **takes_over})
     with pytest.raises(ValueError, match="experiment step has ended"):
         loop.set({"experiment": "step"})
+
+
+def test_limits_are_the_experiments_where_they_bear_its_name_and_else_stay() -> None:
+    mine = {"safe_range.output": [-9.0, 9.0], "experiment_lease": 3.0}
+    loop = at_rest(**mine)
+    before = dict(loop.values)
+    loop.set({**BEGIN, "experiment_lease": 8.0})
+    loop.set({"experiment": "step", "safe_range.effort": [-4.0, 4.0], "experiment_duration": 9.0})
+    loop.set({"safe_range.output": [-3.0, 3.0]})
+    assert loop.values["safe_range.output"] == [-3.0, 3.0]
+    loop.set({"experiment": ""})
+    assert loop.all_is_as_before({**before, "safe_range.output": [-3.0, 3.0]})
+
+
+@pytest.mark.parametrize("ended", ["without an output", "after one"])
+def test_the_loop_goes_on_with_the_integral_action_of_before_an_experiment(ended: str) -> None:
+    loop = at_rest(ki=10.0)
+    before = loop.session.integral
+    loop.set({**BEGIN, "experiment_setpoint": 1.0})
+    loop.run(20)
+    during = loop.session.integral
+    assert before is not None and during is not None and abs(during[0] - before[0]) > 0.1
+    loop.end("the controller was deactivated")
+    if ended == "after one":
+        loop.run(1)
+    now = loop.session.integral
+    assert now is not None and now == pytest.approx(before, abs=0.05)
 
 
 def test_gains_that_are_set_with_the_end_stay_and_the_effort_does_not_jump() -> None:

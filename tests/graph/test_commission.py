@@ -19,6 +19,7 @@ from commissioned_plants import LOOPS, QUICK, Loop
 
 from tdof_npid_ros.case import Case, load_case
 from tdof_npid_ros.control.gains import Gains
+from tdof_npid_ros.parameters import EXPERIMENT
 from tdof_npid_ros.plants.catalog import named_model
 from tdof_npid_ros.stability.margins import margins
 from tdof_npid_ros.tuning.judge import Constraints
@@ -145,8 +146,10 @@ def test_ctrl_c_leaves_the_loop_as_it_was(graph: Any, tmp_path: Path, moment: st
     graph.wait_until(lambda: tool.poll() is not None, 60.0, "the tool's end")
     _, errors = tool.communicate()
     assert (tool.returncode, errors) == (130, "tdof-npid commission: interrupted\n")
-    found = graph.get_parameters("/loop/controller", "experiment", "kp", "ki", "manual", "setpoint")
-    assert found == ["", *loop.gains, loop.by_hand, loop.start]
+    found = graph.get_parameters("/loop/controller", *EXPERIMENT, "kp", "ki", "manual", "setpoint")
+    limits = {f"safe_range.{signal}": list(range_) for signal, range_ in ranges(loop).items()}
+    before = {name: its.default for name, its in EXPERIMENT.items()} | limits
+    assert found == [*before.values(), *loop.gains, loop.by_hand, loop.start]
 
 
 PLAIN = {"kp": 0.3, "ki": 2.0, "sigma": 1.0}

@@ -16,8 +16,10 @@ import pytest
 
 from tdof_npid_ros.analysis.verify import verify
 from tdof_npid_ros.cli.experiment import records_to
+from tdof_npid_ros.parameters import EXPERIMENT
 
 PERIOD = 0.01
+BEFORE = {name: its.default for name, its in EXPERIMENT.items()}
 GAINS = {"kp": 2.0, "ki": 4.0, "kd": 0.0, "manual": False}  # the integral takes the plant's pole: at rest in 1 s
 
 
@@ -65,9 +67,9 @@ def begin(graph: Any, name: str, **moves: Any) -> None:
 
 
 def is_as_before(graph: Any) -> bool:
-    names = ["experiment", "experiment_setpoint", "experiment_effort", *GAINS]
+    names = [*EXPERIMENT, *GAINS]
     found = graph.get_parameters("/robot/controller", *names)
-    return found == ["", math.inf, math.inf, *GAINS.values()]
+    return found == [*{**BEFORE, "experiment_lease": 5.0}.values(), *GAINS.values()]
 
 
 def test_whatever_stops_an_experiment_all_is_as_before_and_verified(graph: Any, tmp_path: Path) -> None:
@@ -153,6 +155,58 @@ def test_an_operators_setpoint_ends_an_experiment_and_holds(graph: Any) -> None:
     with graph.expect_log(controller, "an operator has given a setpoint"):
         graph.publish_until(publisher, JointState(position=[0.5]), lambda: "has ended" in controller.log)
     graph.wait_until(lambda: robot.y == pytest.approx(0.5, abs=0.02), 60.0, "the operator's setpoint")
+
+
+@pytest.mark.parametrize("ended", ["by the deactivation", "by silence"])
+def test_an_inactive_time_keeps_the_integral_action_of_before_the_experiment(graph: Any, ended: str) -> None:
+    from sensor_msgs.msg import JointState
+
+    controller = graph.start(
+        "controller", namespace="/robot", kp=2.0, ki=4.0, sample_period=PERIOD, setpoint=1.0, output_timeout=1.0
+    )
+    graph.wait_for_nodes("/robot/controller")
+    robot = Robot(graph)
+    graph.wait_until(robot.rests, 60.0, "rest")
+    begin(graph, "step", experiment_setpoint=1.5, experiment_lease=30.0)
+    graph.wait_until(lambda: min(robot.y, robot.u) > 1.45, 60.0, "the step")
+    if ended == "by silence":
+        robot.silent = True
+        graph.wait_for_log(controller, "experiment step has ended")
+    assert graph.change_state("/robot/controller", "deactivate")
+    robot.behave()
+    robot.says = 1.0  # at the setpoint of before, the effort is the integral action, and stays
+    graph.catch_up()
+    efforts = graph.collect("/robot/control_effort", JointState)
+    assert graph.change_state("/robot/controller", "activate")
+    graph.wait_until(lambda: efforts, 60.0, "an effort")
+    assert efforts[-1].effort[0] == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_an_experiment_restores_gives_no_sigma(graph: Any) -> None:
+    graph.start("controller", namespace="/robot", type="pid", kp=2.0, ki=4.0, sample_period=PERIOD, setpoint=1.0)
+    graph.wait_for_nodes("/robot/controller")
+    robot = Robot(graph)
+    graph.wait_until(robot.rests, 60.0, "rest")
+
+    def set_(**values: Any) -> str:
+        result = graph.set_parameters("/robot/controller", atomically=True, **values)[0]
+        return "" if result.successful else str(result.reason)
+
+    needs_sigma = "type npid needs sigma"
+    begin(graph, "plain", experiment_setpoint=1.1, experiment_lease=60.0)
+    assert needs_sigma in set_(type="npid")
+    assert set_(experiment="") == ""
+    assert needs_sigma in set_(type="npid")
+    begin(graph, "its own", type="tdof_npid2", sigma=0.5, experiment_lease=60.0)
+    assert set_(experiment="its own", experiment_setpoint=1.1) == ""
+    assert needs_sigma in set_(type="npid")
+    assert set_(experiment="") == ""
+    assert needs_sigma in set_(type="npid")
+    begin(graph, "kept", experiment_lease=60.0)
+    assert set_(experiment="", type="npid", sigma=1.0) == ""
+    begin(graph, "next", type="pid", experiment_lease=60.0)
+    assert set_(experiment="") == ""
+    assert set_(type="tdof_npid1") == ""
 
 
 def test_a_recorder_that_has_lost_messages_records_all_the_same() -> None:
