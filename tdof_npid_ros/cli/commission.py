@@ -22,6 +22,7 @@ from tdof_npid_ros.interruption import afterwards, heeded
 from tdof_npid_ros.output_file import OutputError, check_outputs, new_folder
 from tdof_npid_ros.plants.plant import PlantError
 from tdof_npid_ros.tuning import TuningError
+from tdof_npid_ros.tuning.judge import Constraints
 
 if TYPE_CHECKING:
     from tdof_npid_ros.graph.experimenter import LoopAtWork
@@ -52,6 +53,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.json and not arguments.yes:
         raise ValueError("--json asks nothing: give --yes, too")
+    # What no gains could have is refused before anything touches the plant.
+    controller_type(arguments.controller)
+    Constraints(ms=arguments.ms)
     bag = new_folder(arguments.bag or Path("bags") / f"commission-{time.strftime('%Y%m%d-%H%M%S')}")
     if arguments.out is not None and arguments.out.exists():
         raise OutputError(f"{arguments.out} exists and is not overwritten: give another name")

@@ -18,6 +18,7 @@ import pytest
 from commissioned_plants import LOOPS, QUICK, Loop
 
 from tdof_npid_ros.case import Case, load_case
+from tdof_npid_ros.cli import main
 from tdof_npid_ros.control.gains import Gains
 from tdof_npid_ros.parameters import EXPERIMENT
 from tdof_npid_ros.plants.catalog import named_model
@@ -205,3 +206,21 @@ def test_several_lanes_are_refused_with_what_to_do(graph: Any, tmp_path: Path, g
     told = "the loop has 2 lanes: an experiment is of one; give that one a controller"
     assert (tool.returncode, (tmp_path / "tool.log").read_text()) == (2, f"tdof-npid commission: {told}\n")
     assert graph.get_parameters("/loop/controller", "experiment", *gains) == ["", *gains.values()]
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (["--ms", "0.9"], "ms is 0.9: it must be above 1"),
+        (["--ms", "1"], "ms is 1: it must be above 1"),
+        (["--ms", "0"], "ms is 0: it must be above 1"),
+        (["--ms", "nan"], "ms is nan: it must be above 1"),
+        (["--controller", "fuzzy"], "no controller type 'fuzzy'"),
+    ],
+)
+def test_what_no_gains_could_have_is_refused_before_a_loop_is_looked_for(
+    asked: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["commission", "/nowhere", "--yes", "--bag", str(tmp_path / "bag"), *asked]) == 2
+    said = capsys.readouterr().err
+    assert told in said and said.count("\n") == 1
