@@ -357,6 +357,51 @@ def test_a_disk_that_fills_up_meanwhile_leaves_the_gains_on_the_controller(
     assert loops.get_parameters("/p1/controller", "type", "kp") == ["pid", study.result.gains.kp]
 
 
+FLEETING_CONTROLLER = """
+import os, sys
+from tdof_npid_ros.graph.controller_node import ControllerNode
+from tdof_npid_ros.graph.runtime.run import run_node
+
+class FleetingController(ControllerNode):
+    sets = 0
+
+    def changed(self, changes):
+        lanes = self.controller.lanes
+        super().changed(changes)
+        self.sets += "kp" in changes
+        if {when}:
+            os._exit(0)
+
+run_node(FleetingController, sys.argv)
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "generations"),
+    [("self.sets > 2 * 3", 3), ("lanes > self.controller.lanes", 1000)],
+    ids=["in mid-run", "in the confirming episode"],
+)
+def test_what_was_found_is_written_though_the_loop_is_lost(
+    loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path, when: str, generations: int
+) -> None:
+    case, result = str(tuner_file("p1-c0.5")), tmp_path / "tuned.yaml"
+    program = FLEETING_CONTROLLER.replace("{when}", when)
+    plant = loops.start("plant", case=case, namespace="/fleeting", reply_timeout=0.2)
+    controller = loops.start("controller", case=case, namespace="/fleeting", program=program)
+    controller.expected_status = None
+    loops.wait_for_nodes("/fleeting/plant", "/fleeting/controller")
+    options = {**QUICK, "polish": 0, "loop_timeout": 2.0, "answer_timeout": 1.0, "result": str(result)}
+    process = loops.start("tuner", "-p", f"case:={case}", namespace="/fleeting", type="pid", seed=8, **options)
+    process.expected_status = 2
+    loops.wait_until(lambda: process.process.poll() is not None, 60, "the end of the tuner")
+    plant.stop()
+    assert "no loop to tune: /fleeting: " in process.log
+    assert f"; the best gains so far could not be set on the controller, but are in {result}" in process.log
+    study = Study(as_the_node_has_it(kind="pid", seed=8, polish=0))
+    study.run(Objective(study.problem), lambda study: study.generation < generations)
+    assert gains_from_mapping(read_parameters(result, "controller")) == study.result.gains
+
+
 @pytest.mark.parametrize("way", ["Ctrl-C", "deactivate"])
 def test_it_ends_with_the_generation_and_leaves_the_best_so_far(
     loops: Any, tuner_file: Callable[[str], Path], tmp_path: Path, way: str

@@ -26,6 +26,7 @@ from tdof_npid_ros.output_file import check_writable
 from tdof_npid_ros.parameter import ParameterError
 from tdof_npid_ros.parameter_file import check_replaceable, write_parameters
 from tdof_npid_ros.parameters import BOUNDS, TUNER
+from tdof_npid_ros.tuning import TuningError
 from tdof_npid_ros.tuning.alternate import StepTest
 from tdof_npid_ros.tuning.ask_tell import Array, Scores
 from tdof_npid_ros.tuning.judge import Constraints
@@ -186,12 +187,13 @@ class TunerNode(LoopNode):
         """Tune until the budget is spent or somebody asks to stop, and leave the best gains on the controllers.
 
         Raises:
-            TuningError: it cannot go on; the best gains so far are on the controllers that answer.
+            TuningError: it cannot go on; the best gains so far are on the controllers that answer, and in the file.
             InterruptedTuningError: asked to stop before it was activated.
         """
         while not self.activated.wait(POLL):
             self.check_interrupted()
         left: tuple[Gains | None, bool] = None, False
+        failure: Exception | None = None
         for reason in self.problem.restless.values() if self.step_test is None else ():
             self.get_logger().warning(f"{reason}, so no loop comes to rest in it and none is asked to")
         self.report("tuning", "tuning")
@@ -207,10 +209,17 @@ class TunerNode(LoopNode):
                 self._confirm()
         except InterruptedTuningError:
             pass  # what it leaves, is told below
+        except (ValueError, RuntimeError, OSError) as error:
+            failure = error  # likewise
         finally:
             self.stop_requested = self.stop_at_once = False
             best = self.study.result.gains if self.study.feasible else None
             left = self.evaluator.restore(best, self.study.best_value)
+        if failure is not None:
+            if left[0] is None:
+                raise failure
+            self._write_result(left[0])
+            raise TuningError(f"{failure}; {self._left(*left)}") from failure
         if self.study.done:
             self.study.require_feasible()
             self._write_result(self.study.result.gains)
@@ -279,12 +288,16 @@ class TunerNode(LoopNode):
         return told + "".join(f"; {name} is at its {end} bound" for name, end in ends.items())
 
     def _interrupted(self, best: Gains | None, is_set: bool) -> str:
+        study, left = self.study, self._left(best, is_set)
+        return f"interrupted after {study.evaluations} of {study.budget} evaluations: {left}; {self.how_to_go_on}"
+
+    def _left(self, best: Gains | None, is_set: bool) -> str:
+        """What the controllers and the result file have, as `Evaluator.restore` tells it."""
         what = "the gains of before" if best is None else "the best gains so far"
         where = f"{what} are on the controller" if is_set else f"{what} could not be set on the controller"
         if best is not None and self.result_file is not None:
             where += f" and in {self.result_file}" if is_set else f", but are in {self.result_file}"
-        study = self.study
-        return f"interrupted after {study.evaluations} of {study.budget} evaluations: {where}; {self.how_to_go_on}"
+        return where
 
     # State
 
