@@ -517,3 +517,56 @@ def test_steps_back_and_forth_that_are_interrupted_at_once_leave_the_best_candid
     kept = gains_from_mapping(read_parameters(result, "controller"))
     assert loops.get_parameters("/cut/controller", "type", "kp", "ki", "kd") == ["pid", kept.kp, kept.ki, kept.kd]
     assert (kept.kp, kept.ki, kept.kd) != (1.0, 0.3, 0.0)
+
+
+def test_an_integral_action_that_a_killed_tuner_holds_is_not_taken_for_the_operator_s(
+    loops: Any, tuner: LiveTuner
+) -> None:
+    from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
+    from tdof_npid_ros.graph.tuner.patience import Patience
+    from tdof_npid_ros.tuning.alternate import StepTest
+
+    held = {"integral_min": 0.3, "integral_max": 0.3}
+    loops.start("plant", case="p1-c0.5", namespace="/held", mode="realtime", effort_timeout=10.0)
+    loops.start("controller", case="p1-c0.5", namespace="/held", output_timeout=0.0, **held)
+    loops.wait_for_nodes("/held/plant", "/held/controller")
+    before = loops.get_parameters("/held/controller", "kp", *held)
+    test = StepTest((0.0, 1.0), 0.1, 0.2, 1.0, (-1.0, 2.0), (-40.0, 40.0))
+    loop = AlternateLoop(tuner.node, problem(kind="pid"), test, "/held", Patience(60.0, 5.0, lambda: None))
+    with pytest.raises(TuningError, match=r"/held/controller has integral_min and integral_max 0\.3, as a"):
+        loop.evaluate(np.ones((1, 3)))
+    assert loop.restore(None, float("inf")) == (None, True)
+    assert loops.get_parameters("/held/controller", "kp", *held) == before
+
+
+def test_of_a_robot_s_joints_the_one_that_the_controller_drives_is_tuned(loops: Any, tuner: LiveTuner) -> None:
+    from sensor_msgs.msg import JointState
+
+    from tdof_npid_ros.graph.tuner.alternate_loop import AlternateLoop
+    from tdof_npid_ros.graph.tuner.patience import Patience
+    from tdof_npid_ros.tuning.alternate import StepTest
+
+    output = JointState(name=["shoulder", "elbow"], position=[5.0, 0.0], effort=[90.0, 0.0])
+    publisher = loops.node.create_publisher(JointState, "/arm/output", 10)
+
+    def follow(setpoint: JointState) -> None:
+        output.position = [5.0, setpoint.position[0]]
+
+    def publish() -> None:
+        output.header.stamp = loops.node.get_clock().now().to_msg()
+        publisher.publish(output)
+
+    loops.node.create_subscription(JointState, "/arm/setpoint", follow, 10)
+    timer = loops.node.create_timer(0.02, publish)
+    loops.start(
+        "controller", namespace="/arm", type="pid", joint_names=["elbow"], sample_period=0.02, output_timeout=0.0
+    )
+    loops.wait_for_nodes("/arm/controller")
+    test = StepTest((0.0, 1.0), 0.1, 0.2, 5.0, (-1.0, 2.0), (-40.0, 40.0))
+    loop = AlternateLoop(tuner.node, problem(kind="pid"), test, "/arm", Patience(60.0, 5.0, lambda: None))
+    found: list[Scores] = []
+    run = threading.Thread(target=lambda: found.append(loop.evaluate(np.ones((1, 3)))))
+    run.start()
+    loops.wait_until(lambda: not run.is_alive(), 60, "the end of the trial")
+    loops.node.destroy_timer(timer)
+    assert found and found[0].violation.tolist() == [0.0] and found[0].objective[0] < 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains, gains_from_mapping
+from tdof_npid_ros.control.joints import Joints
 from tdof_npid_ros.graph.runtime.messages import signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.qos import SIGNAL_QOS
 from tdof_npid_ros.graph.tuner.loop_client import tuned_parameters
@@ -55,6 +57,7 @@ class AlternateLoop:
         self._patience = patience
         name = in_namespace(namespace, "controller")
         self._controller = TunedNode(node, name, patience.for_an_answer, patience.check)
+        self._joints = Joints(())
         self._good: Gains | None = None
         self._best = float("inf")
         self._level = test.levels[0]
@@ -126,8 +129,16 @@ class AlternateLoop:
                     f"no loop to tune: no output in {self._namespace} within {self._patience.for_a_loop:g} s"
                 )
             time.sleep(POLL)
-        self._good = gains_from_mapping(self._controller.parameters(GAIN_NAMES))
-        self._limits = self._good.integral_min, self._good.integral_max
+        found = self._controller.parameters([*GAIN_NAMES, "joint_names"])
+        good = gains_from_mapping(found)
+        if good.integral_min == good.integral_max:
+            raise TuningError(
+                f"{self._controller.name} has integral_min and integral_max {good.integral_min:g}, as a tuner that was "
+                "killed leaves them: set both as they were, -inf and inf for instance, and the gains, then start again"
+            )
+        self._joints = Joints(found["joint_names"] or ())
+        self._limits = good.integral_min, good.integral_max
+        self._good = good
 
     def _evaluate_one(self, candidate: Array) -> tuple[float, float]:
         self._settle_with_good_gains()
@@ -213,16 +224,17 @@ class AlternateLoop:
         return int(clock.now().nanoseconds) if clock.ros_time_is_active else time.monotonic_ns()
 
     def _on_output(self, message: JointState) -> None:
-        if not message.position:
+        output, effort = self._picked(message, message.position), self._picked(message, message.effort)
+        if output is None:
             return
         self._outputs += 1
         stamp = stamp_ns(message.header.stamp)
         self._first_ns = stamp if self._first_ns is None else self._first_ns
-        now, output = (stamp - self._first_ns) / 1e9, message.position[0]  # small, so that it is exact
+        now = (stamp - self._first_ns) / 1e9  # small, so that it is exact
         watching = self._watching
         if isinstance(watching, Trial):
             before = watching.setpoint
-            watching.take(now, output, message.effort[0] if message.effort else None)
+            watching.take(now, output, effort)
             if watching.setpoint != before:
                 self._publish_setpoint(watching.setpoint)
             if watching.outcome == "unsafe":
@@ -237,6 +249,14 @@ class AlternateLoop:
         if ended:
             self._watching = None
             self._ended.set()
+
+    def _picked(self, message: JointState, field: Sequence[float]) -> float | None:
+        """The value of the joint that the controller drives, the first one if it names none; None: there is none."""
+        try:
+            values = self._joints.selected(message.name, np.asarray(field))
+        except ValueError:
+            return None
+        return float(values[0]) if len(values) else None
 
     def _on_controller_state(self, message: JointState) -> None:
         terms = dict(zip(message.name, message.position, strict=False))
