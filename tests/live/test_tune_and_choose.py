@@ -66,6 +66,8 @@ def test_one_of_several_loops_and_lanes_is_chosen_and_a_joined_loop_outlives_the
             model(page, "lane", "w.value = '1'")
             eventually(lambda: model(page, "kp_field", "w.value") == 1.0, "lane 1's kp")
             model(page, "alone", "w.active = true")
+            model(page, "kp_field", "w.value = 3")  # a whole number among others
+            eventually(lambda: host.tdof_npid("get", "kp")["kp"] == [2.0, 3.0], "that lane's kp")
             model(page, "kp_field", "w.value = 0.7")
             page.get_by_role("button", name="tune", exact=True).click()
             eventually(lambda: "no parameter file is known" in str(model(page, "tuning", "w.text")), "what is missing")

@@ -26,6 +26,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import Trigger
 
+from tdof_npid_ros.one_line import one_line
+from tdof_npid_ros.parameter import LONGEST_VALUE
+
 ASK_AGAIN = 1.0  # s until a request is sent again
 LOOK_PERIOD = 0.02  # s between two looks whether a service is there
 
@@ -163,7 +166,11 @@ class RemoteNode:
         return Question(self._client(GetParameters, "get_parameters"), GetParameters.Request(names=list(names)), read)
 
     def ask_to_set(self, values: Mapping[str, Any]) -> Question[None]:
-        """Set parameters as a whole: all, or none of them."""
+        """Set parameters as a whole: all, or none of them.
+
+        Raises:
+            RefusedError: no parameter can have that value.
+        """
 
         def read(response: SetParametersAtomically.Response) -> None:
             if not response.result.successful:
@@ -173,7 +180,11 @@ class RemoteNode:
         return Question(client, SetParametersAtomically.Request(parameters=_messages(values)), read)
 
     def ask_to_set_each(self, values: Mapping[str, Any]) -> Question[dict[str, str]]:
-        """Set parameters one by one; the answer gives the reasons for those that were refused, by name."""
+        """Set parameters one by one; the answer gives the reasons for those that were refused, by name.
+
+        Raises:
+            RefusedError: no parameter can have that value.
+        """
 
         def read(response: SetParameters.Response) -> dict[str, str]:
             results = zip(values, response.results, strict=False)
@@ -252,7 +263,30 @@ def told_as(silent: type[Exception], refused: type[Exception]) -> Iterator[None]
 
 
 def _messages(values: Mapping[str, Any]) -> list[Any]:
-    return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    """Parameters as messages.
+
+    Raises:
+        RefusedError: no parameter can have that value.
+    """
+    return [_message(name, value) for name, value in values.items()]
+
+
+def _message(name: str, value: Any) -> Any:
+    """A parameter as a message; whole numbers among others in a list become floats, as a list is of one kind."""
+    try:
+        if isinstance(value, list | tuple) and set(map(type, value)) == {int, float}:
+            value = [float(one) for one in value]
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(one, int):  # over what does not fit its message, the middleware ends the process
+                one.to_bytes(8, "little", signed=True)
+            elif isinstance(one, str):
+                one.encode()
+        return Parameter(name, value=value).to_parameter_msg()
+    except (TypeError, ValueError, OverflowError):
+        raise RefusedError(
+            f"{name} is {one_line(value, LONGEST_VALUE)}: it must be true or false, a number (a whole one of 64 bits "
+            "at most), text, or a list of one of these"
+        ) from None
 
 
 def _plain(value: ParameterValue) -> Any:
