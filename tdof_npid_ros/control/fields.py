@@ -104,17 +104,19 @@ class FieldReader:
             sent_ns: the stamp of a message without a header.
 
         Raises:
-            FieldPathError: a field is not there.
+            FieldPathError: a field is not there, or the stamp is no time.
         """
+        header = message.get("header")
+        frame_id = ""
+        if isinstance(header, Mapping) and "stamp" in header:
+            sent_ns = _time_ns(int(header["stamp"]["sec"]), int(header["stamp"]["nanosec"]))
+            frame_id = str(header.get("frame_id", ""))
+        else:
+            sent_ns = _time_ns(*divmod(sent_ns, SECOND))
         mine = [i for i, field in enumerate(self._fields) if field.path.topic == topic]
         found = [self._fields[i].path.select(message) for i in mine]
         for i, one in zip(mine, found, strict=True):  # in this order of sums on every machine
             self._values[i] = one.values * self._fields[i].scale + self._fields[i].offset
-        header = message.get("header")
-        frame_id = ""
-        if isinstance(header, Mapping) and "stamp" in header:
-            sent_ns = int(header["stamp"]["sec"]) * SECOND + int(header["stamp"]["nanosec"])
-            frame_id = str(header.get("frame_id", ""))
         names = found[0].names if self._takes_names else ()
         if len(self.types) == 1:
             return Sample(sent_ns, frame_id, names, np.concatenate(self._values), NO_VALUES, NO_VALUES)
@@ -128,6 +130,17 @@ class FieldReader:
         stamp_ns = max(self._new.values())
         self._new.clear()
         return Sample(stamp_ns, "", (), np.concatenate(values), NO_VALUES, NO_VALUES)
+
+
+def _time_ns(seconds: int, nanoseconds: int) -> int:
+    """A stamp in ns.
+
+    Raises:
+        FieldPathError: no message could bear it.
+    """
+    if not (-(2**31) <= seconds < 2**31 and 0 <= nanoseconds < SECOND):
+        raise FieldPathError(f"its stamp of {seconds} s and {nanoseconds} ns is no time")
+    return seconds * SECOND + nanoseconds
 
 
 class FieldWriter:

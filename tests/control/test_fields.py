@@ -65,6 +65,27 @@ def test_what_is_no_field_is_refused_with_the_reason(texts: Any, reason: str) ->
         read(texts, IMU)
 
 
+@pytest.mark.parametrize(("sec", "nanosec"), [(3, 10**9), (2**31 - 1, 2**32 - 1), (2**31, 0)])
+def test_a_stamp_that_is_no_time_is_refused_and_nothing_of_its_message_is_taken(sec: int, nanosec: int) -> None:
+    reader = FieldReader(parse_fields(TWO))
+    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}
+    bad = {"header": header, "angular_velocity": {"x": 7.0, "y": 7.0, "z": 7.0}}
+    assert reader.read("/imu", IMU, SENT_NS) is None
+    with pytest.raises(FieldPathError, match="is no time"):
+        reader.read("/imu", bad, SENT_NS)
+    sample = reader.read("/b", {"data": 0.5}, 6)
+    assert sample is not None and (sample.stamp_ns, sample.position[1]) == (STAMPED, 6.0)
+
+
+@pytest.mark.parametrize("sent_ns", [2**31 * 10**9, -(2**31) * 10**9 - 1, 2**63 - 1])
+def test_a_time_of_sending_that_no_stamp_holds_is_refused(sent_ns: int) -> None:
+    reader = FieldReader(parse_fields("/level std_msgs/msg/Float64 data"))
+    with pytest.raises(FieldPathError, match="is no time"):
+        reader.read("/level", {"data": 0.25}, sent_ns)
+    sample = reader.read("/level", {"data": 0.25}, -1)
+    assert sample is not None and sample.stamp_ns == -1
+
+
 TWO = [
     "/b std_msgs/msg/Float64 data",
     "/imu sensor_msgs/msg/Imu angular_velocity.z 2",

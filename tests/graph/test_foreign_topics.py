@@ -186,3 +186,19 @@ def test_without_a_header_the_stamp_is_the_time_of_sending(graph: Any) -> None:
     assert sent_ns == sorted(set(sent_ns)) and abs(sent_ns[-1] - time.time_ns()) < 60 * 10**9
     assert list(efforts[-1].effort) == [1.5] and list(outputs[-1].position) == [0.25]
     assert {m.header.stamp.nanosec for m in efforts[-2:]} <= {m.header.stamp.nanosec for m in outputs}
+
+
+@pytest.mark.parametrize("seconds", [5, 2**31 - 1])
+def test_a_malformed_stamp_is_refused_and_the_controller_goes_on(graph: Any, seconds: int) -> None:
+    from builtin_interfaces.msg import Time
+    from sensor_msgs.msg import Imu, JointState
+
+    efforts = graph.collect("control_effort", JointState)
+    field = "/imu/data sensor_msgs/msg/Imu angular_velocity.z"
+    controller = graph.start("controller", type="pid", kp=2.0, setpoint=1.0, output_from=field, setpoint_from=field)
+    imu, message = graph.publisher("/imu/data", Imu), Imu()
+    message.header.stamp = Time(sec=seconds, nanosec=2**32 - 1)
+    graph.publish_until(imu, message, lambda: int(graph.fact("/controller", "rejected", 0)), what="a refusal")
+    assert not efforts and "is no time" in controller.log
+    message.header.stamp = Time(sec=5, nanosec=10_000_000)
+    graph.publish_until(imu, message, lambda: efforts, what="an answer")
