@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from tdof_npid_ros.graph.runtime.messages import EPISODE, lane_names, plan_message, set_stamp, signal_message, stamp_ns
 from tdof_npid_ros.graph.runtime.node import OK, STEADY, WARN, LoopNode
-from tdof_npid_ros.graph.runtime.parameter_client import Question, RemoteNode
+from tdof_npid_ros.graph.runtime.parameter_client import Question, RefusedError, RemoteNode
 from tdof_npid_ros.graph.runtime.qos import LATCHED_QOS, SIGNAL_QOS
 from tdof_npid_ros.graph.runtime.realtime import SteadyRosTime
 from tdof_npid_ros.graph.runtime.run import run_node
@@ -216,6 +216,7 @@ class ScenarioNode(LoopNode):
         if self.resetting is None:
             self.get_logger().warning("no plant/reset here: playing without it, from wherever the output is")
         else:
+            self._tell_of_refusal(self.resetting)
             self.resetting.drop()
         self.started_ns, self.zero_ns = now, self.ros_ns
         self._publish_plan(plan)
@@ -258,6 +259,13 @@ class ScenarioNode(LoopNode):
             self.before = self.label
             self.resetting = self.plant.ask_trigger("reset", repeats=True)
         return self.resetting.look() or self.label != self.before
+
+    def _tell_of_refusal(self, resetting: Question[str]) -> None:
+        if resetting.answered.is_set():
+            try:
+                _ = resetting.answer
+            except RefusedError as error:
+                self.refuse("rejected", "the plant does not begin anew", f": {error}")
 
     def _restore_plant(self) -> None:
         before, self.plant_before = self.plant_before, {}

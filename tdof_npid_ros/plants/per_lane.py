@@ -133,6 +133,16 @@ def sampled_plants(plant: Plant, sample_period_ns: int) -> tuple[Any, np.ndarray
     return sampled, own.ravel()
 
 
+def check_lanes(plant: Plant, lanes: int) -> None:
+    """Make sure that plants of their own are for so many lanes: compiled code does not look.
+
+    Raises:
+        PlantError: they are not.
+    """
+    if isinstance(plant, EachLane) and len(plant.plants) != lanes:
+        raise PlantError(f"lanes is {lanes}, but there are plants for {len(plant.plants)}: give one number per lane")
+
+
 def initial_lanes(plant: Plant, lanes: int) -> tuple[tuple[float, ...], np.ndarray, np.ndarray]:
     """Of all lanes: a state like theirs, their states at time 0, (states, lanes), and efforts before, (lanes,).
 
@@ -142,8 +152,7 @@ def initial_lanes(plant: Plant, lanes: int) -> tuple[tuple[float, ...], np.ndarr
     if not isinstance(plant, EachLane):
         state = plant.initial_state
         return state, np.repeat(np.array(state)[:, None], lanes, axis=1), np.full(lanes, plant.initial_effort)
-    if len(plant.plants) != lanes:
-        raise PlantError(f"lanes is {lanes}, but there are plants for {len(plant.plants)}: give one number per lane")
+    check_lanes(plant, lanes)
     plants = _of_one_kind(list(plant.plants))
     return plants[0].initial_state, _states(plants), np.array([one.initial_effort for one in plants])
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from tdof_npid_ros.plants.kernels import check_same_delay, kernel_for
 from tdof_npid_ros.plants.lanes import advance_lanes, output_lanes
-from tdof_npid_ros.plants.per_lane import initial_lanes, sampled_plants
+from tdof_npid_ros.plants.per_lane import check_lanes, initial_lanes, sampled_plants
 from tdof_npid_ros.plants.plant import Plant
 
 
@@ -31,8 +31,9 @@ class PlantSimulator:
         """Go on with other parameters; the state is kept.
 
         Raises:
-            PlantError: the dead time is another one.
+            PlantError: the dead time is another one, or there are plants for another number of lanes.
         """
+        check_lanes(plant, self.lanes)
         sampled, own = sampled_plants(plant, self.sample_period_ns)
         if self._ring is not None:
             check_same_delay(sampled, len(self._ring) // self.lanes)

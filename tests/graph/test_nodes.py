@@ -272,6 +272,8 @@ def test_an_answer_that_nobody_could_hear_yet_is_given_again(graph: Any) -> None
         ("plant", {"mode": "fast"}, "mode"),
         ("plant", {"model": "no.such:Plant"}, "no.such"),
         ("plant", {"lanes": 0}, "lanes"),
+        ("plant", {"start": 1e6, "effort_min": 0.0, "effort_max": 100.0}, "beyond its limits 0 to 100"),
+        ("plant", {"start": 1e6, "effort_max": 100.0, "mode": "lockstep"}, "beyond its limits -inf to 100"),
         ("scenario", {"episodes": ["missing"], "plan__missing": ["0 setpoint 1"]}, "end"),
     ],
 )

@@ -196,3 +196,73 @@ def test_an_episode_in_realtime_begins_at_rest_where_its_plan_says(graph: Any) -
     assert all(abs(m.position[0] - 60.0) < 1e-6 for m in still)
     at_rest = [m.effort[0] for m in efforts if m.header.frame_id.split()[-1] == outputs[began].header.frame_id]
     assert all(abs(effort - 50.0) < 1e-6 for effort in at_rest[: len(still) - 5])
+
+
+def test_a_plant_that_cannot_rest_where_it_is_to_begin_refuses_it_and_goes_on(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+    from std_srvs.srv import Trigger
+
+    outputs = graph.collect("output", JointState)
+    plant = graph.start("plant", sample_period=0.01, time_constant=0.5, effort_min=0.0, effort_max=100.0)
+    graph.wait_for_nodes("/plant")
+
+    def reason(**values: float) -> str:
+        (result,) = graph.set_parameters("/plant", **values)
+        return "" if result.successful else str(result.reason)
+
+    assert reason(start=1e6) == "start 1e+06: the plant rests there with an effort of 1e+06, beyond its limits 0 to 100"
+    assert reason(start=50.0) == "" and graph.call("/plant/reset", Trigger, again=True).success
+    graph.wait_until(lambda: outputs[-1].position[0] > 10.0, what="the episode that begins there")
+    label = outputs[-1].header.frame_id
+    assert "effort of 50, beyond its limits 0 to 40" in reason(effort_max=40.0)
+    assert reason(gain=0.1) == ""  # as a plan may change it, in the midst of an episode that began at 50
+    refused = graph.call("/plant/reset", Trigger, again=True)
+    assert not refused.success and "effort of 500, beyond its limits 0 to 100" in refused.message
+    graph.catch_up()
+    seen = len(outputs)
+    graph.wait_until(lambda: len(outputs) > seen + 20, what="a plant that goes on")
+    assert outputs[-1].header.frame_id == label
+    assert reason(gain=1.0) == "" and graph.call("/plant/reset", Trigger, again=True).success
+    graph.wait_until(lambda: outputs[-1].header.frame_id != label, what="a new episode")
+    assert "Traceback" not in plant.log
+
+
+def test_plants_for_other_lanes_wait_for_the_reset_with_them(graph: Any) -> None:
+    from sensor_msgs.msg import JointState
+    from std_srvs.srv import Trigger
+
+    outputs = graph.collect("output", JointState)
+    quick = {"sample_period": 0.01, "time_constant": 0.05, "dead_time": 0.0, "effort_timeout": 0.0}
+    graph.start("plant", **quick, lanes=3, gain=[1.0, 2.0, 3.0])
+    efforts = graph.publisher("control_effort", JointState)
+
+    def rests_at(*values: float) -> None:
+        there = lambda: outputs and np.allclose(outputs[-1].position, values, atol=1e-3)  # noqa: E731
+        graph.publish_until(efforts, JointState(effort=[1.0] * len(values)), there, what=f"outputs of {values}")
+
+    def changed(**values: Any) -> None:
+        (result,) = graph.set_parameters("/plant", atomically=True, **values)
+        assert result.successful, result.reason
+
+    rests_at(1.0, 2.0, 3.0)
+    for lanes, gain in ((2, [5.0, 4.0]), (4, [5.0, 4.0, 3.0, 2.0])):
+        before = list(outputs[-1].position)
+        changed(lanes=lanes, gain=gain)
+        graph.catch_up()
+        seen = len(outputs)
+        graph.wait_until(lambda seen=seen: len(outputs) > seen + 50, what="half a second")
+        assert np.allclose(outputs[-1].position, before, atol=1e-3)
+        assert graph.call("/plant/reset", Trigger, again=True).success
+        graph.wait_until(lambda lanes=lanes: len(outputs[-1].position) == lanes, what="the other lanes")
+        rests_at(*gain)
+    changed(gain=[1.0] * 4)  # of the same lanes: at once
+    rests_at(1.0, 1.0, 1.0, 1.0)
+
+
+def test_a_scenario_tells_of_a_plant_that_does_not_begin_anew(graph: Any) -> None:
+    graph.start("plant", sample_period=0.01, start=50.0, effort_max=100.0)
+    graph.wait_for_nodes("/plant")
+    assert graph.set_parameters("/plant", gain=0.1)[0].successful
+    scenario = graph.start("scenario", sample_period=0.01, episodes=["a"], plan__a=["0 setpoint 1", "0.1 end"])
+    graph.wait_for_log(scenario, "the plant does not begin anew: /plant/reset: start 50: the plant rests there")
+    graph.wait_for_log(scenario, "all episodes played")

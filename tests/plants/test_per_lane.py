@@ -11,9 +11,11 @@ import pytest
 
 from tdof_npid_ros.case import Case, make_case
 from tdof_npid_ros.control.gains import GainsError
+from tdof_npid_ros.plants.catalog import make_plant
 from tdof_npid_ros.plants.linear import TransferFunction, sampled_lanes
 from tdof_npid_ros.plants.ode import load_class
 from tdof_npid_ros.plants.plant import PlantError
+from tdof_npid_ros.plants.simulator import PlantSimulator
 
 Changes = dict[str, Any]
 
@@ -122,6 +124,15 @@ def test_what_lanes_cannot_differ_in_is_refused() -> None:
         case.simulate("setpoint", case.gains.with_values(kp=(1.0, 2.0, 3.0)), case.lane_plants("setpoint", [{}, {}]))
     with pytest.raises(GainsError, match="law alone"):
         short({"model": "first_order"}, dead_band=0.1).simulate("setpoint", None, case.lane_plants("setpoint", [{}]))
+
+
+def test_a_simulator_takes_plants_for_its_own_lanes_alone() -> None:
+    """Compiled code does not look: it would read past the end of what the plants differ in."""
+    simulator = PlantSimulator(make_plant("first_order", {"gain": [1.0, 2.0, 3.0]}), 10_000_000, 3, (-1.0, 1.0))
+    for gain in ([1.0, 2.0], [1.0, 2.0, 3.0, 4.0]):
+        with pytest.raises(PlantError, match=f"lanes is 3, but there are plants for {len(gain)}"):
+            simulator.change_plant(make_plant("first_order", {"gain": gain}))
+    simulator.change_plant(make_plant("first_order", {"gain": [3.0, 2.0, 1.0]}))
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 5])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +22,9 @@ from tdof_npid_ros.parameter_file import ParameterFileError, read_parameters
 from tdof_npid_ros.parameters import NOISE, PLANT, sample_period_in_ns
 from tdof_npid_ros.plants.catalog import effort_limits, make_plant, model_table, named_model
 from tdof_npid_ros.plants.plant import EachLane, Plant
+from tdof_npid_ros.plants.start import plant_at_start
 
+LIMITS = ("effort_min", "effort_max")
 MODES: dict[str, type[LockstepPlant] | type[RealtimePlant]] = {"lockstep": LockstepPlant, "realtime": RealtimePlant}
 
 
@@ -71,9 +74,12 @@ class PlantNode(LoopEnd):
 
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse changes that do not make a valid whole."""
-        p = {**self.values_of([*self.model_names, *NOISE, "lanes", "effort_min", "effort_max"]), **changes}
-        self._check_lanes(make_plant(self.model, p), p["lanes"])
-        effort_limits(p)
+        p = {**self.values_of([*self.model_names, *NOISE, "lanes", "start", *LIMITS]), **changes}
+        plant, limits = make_plant(self.model, p), effort_limits(p)
+        self._check_lanes(plant, p["lanes"])
+        # A plan may change the plant itself so that it could not rest where it began; then `reset` refuses.
+        if math.isfinite(p["start"]) and changes.keys() & {"start", *LIMITS}:
+            plant_at_start(lambda _: plant, p["start"], {}, limits)
         if self.joints.names and len(self.joints.names) != p["lanes"]:
             raise ValueError(
                 f"joint_names has {len(self.joints.names)} names, but lanes is {p['lanes']}: give one name per lane"

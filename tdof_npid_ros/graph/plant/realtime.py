@@ -15,6 +15,7 @@ from tdof_npid_ros.graph.runtime.loop_end import patience_ns
 from tdof_npid_ros.graph.runtime.node import ERROR, OK, STEADY, WARN
 from tdof_npid_ros.graph.runtime.realtime import LatestTimes, SteadyRosTime
 from tdof_npid_ros.plants.failsafe import FailSafe
+from tdof_npid_ros.plants.plant import EachLane
 from tdof_npid_ros.wire import AnswerLabel, Sample
 
 CLOCK_PERIOD_NS = 10_000_000  # at least, of wall time, between two /clock messages
@@ -35,7 +36,7 @@ class RealtimePlant:
         self.start_ns = node.get_clock().now().nanoseconds  # the stamp of step 0
         self.ros_time = SteadyRosTime(self.start_ns, STEADY.now().nanoseconds, speed)
         self.clock_told_ns = 0
-        self.reset()
+        self._begin()
         node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(as_promised=True), sole=True)
         node.subscribe_signal("disturbance", self._on_disturbance, node.requested_qos(1))
         self.due_from_ns = STEADY.now().nanoseconds  # ticks are due whole periods after
@@ -43,11 +44,18 @@ class RealtimePlant:
 
     def reset(self) -> tuple[bool, str]:
         """Back to the initial state; the next tick is step 0."""
+        try:
+            self._begin()
+        except (ValueError, ArithmeticError) as error:
+            return False, str(error)
+        return True, "at the initial state"
+
+    def _begin(self) -> None:
+        """Begin an episode; a plant that cannot rest at `start` raises ValueError, and changes nothing."""
         port = self._port
         label = port.next_label("")
         port.begin(label, port.new_simulator(label.number))
         self._start()
-        return True, "at the initial state"
 
     def _start(self) -> None:
         lanes = self._port.simulator.lanes
@@ -129,9 +137,10 @@ class RealtimePlant:
 
     def changed(self) -> None:
         """Take over changed parameters."""
-        node = self._node
-        self._port.simulator.change_plant(self._port.plant_at({}))
-        self._port.simulator.effort_limits = self._port.effort_limits()
+        node, simulator, plant = self._node, self._port.simulator, self._port.plant_at({})
+        if not isinstance(plant, EachLane) or len(plant.plants) == simulator.lanes:  # else both wait for the next reset
+            simulator.change_plant(plant)
+        simulator.effort_limits = self._port.effort_limits()
         if node.active:
             self.failsafe.change(*self._failsafe_settings())
 
