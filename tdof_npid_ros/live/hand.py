@@ -67,7 +67,6 @@ class Hand:
         self._setpoint.value = self._shown["setpoint"]
         self._size.value = 1.0 if case is None else case.largest_step or 1.0
         self._disturbance.value = self._by_hand.value = 0.0
-        self._recorded.text = ""
 
     def look(self) -> None:
         """Show what the controller has, and what was refused."""
@@ -78,8 +77,14 @@ class Hand:
             self._shown.get("manual") != steering.values["manual"] or "manual" in steering.problems
         ):
             self._shown["manual"] = self._manual.active = steering.values["manual"]
-        if self._record.active != recordings.runs:
-            self._record.active = recordings.runs
+        recordings.look()
+        self._look_at_recordings()
+
+    def _look_at_recordings(self) -> None:
+        recordings = self._view.loop.recordings
+        self._record.active = recordings.runs
+        told = html.escape(recordings.told)
+        self._recorded.text = f'<span class="refused">{told}</span>' if recordings.failed else told
 
     def _latest(self) -> list[Row]:
         observer = self._view.loop.observer
@@ -123,13 +128,9 @@ class Hand:
             ask(self._view, {"manual_effort": self._of_lanes(lanes, value) if len(lanes) > 1 else value})
 
     def _on_record(self, _: str, __: bool, active: bool) -> None:
-        recordings = self._view.loop.recordings
-        if active == recordings.runs:
-            return
-        try:
-            self._recorded.text = html.escape(recordings.switch(active))
-        except (ValueError, OSError, RuntimeError) as error:
-            self._recorded.text = f'<span class="refused">{html.escape(str(error))}</span>'
+        if active != self._view.loop.recordings.runs:
+            self._view.loop.recordings.switch(active)
+            self._look_at_recordings()
 
 
 def _field(title: str, name: str) -> NumericInput:
