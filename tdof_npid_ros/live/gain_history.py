@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
-Values = dict[str, float]
+Values = dict[str, Any]
 
 
 class GainHistory:
@@ -21,7 +22,7 @@ class GainHistory:
         True
     """
 
-    def __init__(self, first: Mapping[str, float]) -> None:
+    def __init__(self, first: Mapping[str, Any]) -> None:
         self._all: list[Values] = [dict(first)]
         self._at = 0
 
@@ -30,7 +31,7 @@ class GainHistory:
         """What is in force."""
         return dict(self._all[self._at])
 
-    def note(self, values: Mapping[str, float]) -> None:
+    def note(self, values: Mapping[str, Any]) -> None:
         """Something new is in force; what was undone is forgotten."""
         if dict(values) == self._all[self._at]:
             return

@@ -15,8 +15,9 @@ from tdof_npid_ros.case import Case
 from tdof_npid_ros.control.gains import GAIN_NAMES, PER_LANE, gains_from_mapping
 from tdof_npid_ros.control.options import OPTION_NAMES, options_from_mapping
 from tdof_npid_ros.graph.observer import LoopObserver
-from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, RefusedError
+from tdof_npid_ros.graph.runtime.parameter_client import NoAnswerError, Question, RefusedError
 from tdof_npid_ros.live.gain_history import GainHistory
+from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.parameter_file import write_parameters
 from tdof_npid_ros.parameters import sample_period_in_ns
 from tdof_npid_ros.plants.catalog import effort_limits, model_table
@@ -37,7 +38,7 @@ class Steering:
     Attributes:
         values: the controller's parameters; empty before it has answered.
         plant: the plant's; empty where there is none that answers.
-        history: of the gains; None before the controller has answered.
+        history: of the gains with their type; None before the controller has answered.
         problems: why a change was refused, by parameter; what is not a parameter bears its own name.
         margins: of the gains now set, by lane, one where all lanes have the same; empty where they are not known, and
             then `why_no_margins`.
@@ -53,6 +54,7 @@ class Steering:
         self.why_no_margins = "the plant's parameters are not known yet"
         self._tasks: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._margins_of: tuple[Any, ...] = ()
+        self._asked_plant: Question[dict[str, Any]] | None = None
         self._thread = threading.Thread(target=self._work, name="steering", daemon=True)
         self._thread.start()
 
@@ -103,17 +105,26 @@ class Steering:
     # In the thread
 
     def _work(self) -> None:
-        self._look()
+        self._outlive("look", self._look)
         while True:
             try:
                 task = self._tasks.get(timeout=LOOK_PERIOD)
             except queue.Empty:
-                self._look()
-                continue
-            if task is None:
-                return
+                pass
+            else:
+                if task is None:
+                    return
+                self._outlive("task", task)
+            self._outlive("look", self._look)
+
+    def _outlive(self, what: str, task: Callable[[], None]) -> None:
+        """Do it; whatever goes wrong is told, and the thread goes on."""
+        try:
             task()
-            self._look()
+        except Exception as error:
+            self.problems[what] = one_line(f"{type(error).__name__}: {error}")
+        else:
+            self.problems.pop(what, None)
 
     def _try(self, what: str, action: Callable[[], object]) -> bool:
         try:
@@ -137,7 +148,7 @@ class Steering:
         if self.history is not None:
             self.history.note(self._gains())
 
-    def _again(self, gains: Mapping[str, float] | None) -> None:
+    def _again(self, gains: Mapping[str, Any] | None) -> None:
         if gains is not None:
             self._tasks.put(lambda: self._restore(dict(gains)))
 
@@ -146,7 +157,7 @@ class Steering:
             self.values |= gains
 
     def _gains(self) -> dict[str, Any]:
-        return {name: self.values[name] for name in PER_LANE}
+        return {name: self.values[name] for name in ("type", *PER_LANE)}
 
     def _look(self) -> None:
         """Whatever has changed: by us, or by somebody else."""
@@ -163,7 +174,9 @@ class Steering:
             self.history = GainHistory(self._gains())
         elif self.history.now != self._gains():
             self.history.note(self._gains())
-        if not self.plant and self._observer.remote("plant").serves("reset"):
+        if self.plant:
+            self._look_at_plant_again()
+        elif self._observer.remote("plant").serves("reset"):
             self._look_at_plant()
         self._look_at_margins()
 
@@ -178,6 +191,13 @@ class Steering:
             self.plant = known | remote.parameters(list(model_table(model)))
         except (NoAnswerError, RefusedError, ValueError) as error:
             self.why_no_margins = str(error)
+
+    def _look_at_plant_again(self) -> None:
+        """Take over what has changed, once it is told: a plant that does not answer holds nothing up."""
+        asked = self._asked_plant = self._asked_plant or self._observer.remote("plant").ask_parameters(list(self.plant))
+        if asked.look():
+            self._asked_plant, found = None, asked.answer
+            self.plant = found if found["model"] == self.plant["model"] else {}  # begun again as another one
 
     def _look_at_margins(self) -> None:
         """Margins of what is in force, if that has changed."""

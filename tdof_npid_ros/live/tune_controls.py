@@ -75,7 +75,7 @@ class TuneControls:
         view, state = self._view, self._view.loop.tuning.state
         if isinstance(state, Proposal):
             gains = state.gains.as_dict()
-            ask(view, {name: view.for_lane(name, gains[name]) for name in PER_LANE})
+            ask(view, {"type": state.gains.type} | {name: view.for_lane(name, gains[name]) for name in PER_LANE})
             view.loop.tuning.stop()
 
 
