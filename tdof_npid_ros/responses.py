@@ -66,7 +66,7 @@ class Lane:
         disturbance_is_new: likewise.
         seen_late: a change is seen at the first output after it, which may have moved already.
         largest_step: of the setpoint, in the case's scenario: what the recovery band is a fraction of.
-        noise_bound: how far a measured output of a simulated plant is from the plant's at the most.
+        begins: the plant's output at the first sample, without the noise of what is measured; None: it is not known.
         turn: of angles, else 0.
     """
 
@@ -80,7 +80,7 @@ class Lane:
     disturbance_is_new: bool = True
     seen_late: bool = False
     largest_step: float | None = None
-    noise_bound: float = 0.0
+    begins: float | None = None
     turn: float = 0.0
 
 
@@ -102,8 +102,11 @@ def responses(lane: Lane) -> list[Response]:
     changes = [change for change in _changes(lane, first) if change.at < last]
     if not changes or len(changes) > MOST_STEPS or (len(changes) == 1 and changes[0].kind == "tracking"):
         return [_measured(lane, _Change(first, "tracking"), last)]
-    ends = [change.at - lane.seen_late for change in changes[1:]]
-    return [_measured(lane, change, max(end, change.at)) for change, end in zip(changes, [*ends, last], strict=True)]
+    ends = [(change.at - lane.seen_late, change.kind == "setpoint") for change in changes[1:]]
+    return [
+        _measured(lane, change, max(end, change.at), steps_at_end)
+        for change, (end, steps_at_end) in zip(changes, [*ends, (last, False)], strict=True)
+    ]
 
 
 def largest_move(setpoint: np.ndarray, start: float, turn: float = 0.0) -> float:
@@ -166,9 +169,10 @@ def _first_setpoint(lane: Lane, first: int) -> list[_Change]:
         return []
     y = lane.output
     before = float(y[first - 1] if lane.seen_late and first > 0 and not np.isnan(y[first - 1]) else y[first])
-    size = abs(float(difference(lane.setpoint[first], before, lane.turn)))
-    noise = CLEAR_OF_NOISE * _noise(y[:first] if first >= PATH_GAP else y) if lane.seen_late else lane.noise_bound
-    if np.isnan(size) or size <= noise:
+    from_ = before if lane.seen_late or lane.begins is None else lane.begins
+    size = abs(float(difference(lane.setpoint[first], from_, lane.turn)))
+    noise = CLEAR_OF_NOISE * _noise(y[:first] if first >= PATH_GAP else y) if lane.seen_late else 0.0
+    if np.isnan(before) or np.isnan(size) or size <= noise:
         return []
     return [_Change(first, "setpoint", before)]
 
@@ -209,8 +213,8 @@ def _moves(values: np.ndarray, offset: int = 0) -> list[tuple[int, int]]:
     return moves
 
 
-def _measured(lane: Lane, change: _Change, last: int) -> Response:
-    """The response to a change, up to and with the sample `last`."""
+def _measured(lane: Lane, change: _Change, last: int, steps_at_end: bool = False) -> Response:
+    """The response to a change, up to and with the sample `last`, at which the setpoint may step again."""
     window = slice(change.at, last + 1)
     y, r = lane.output[window], lane.setpoint[window]
     start_s, end_s = float(lane.time[change.at]), float(lane.time[last])
@@ -223,8 +227,8 @@ def _measured(lane: Lane, change: _Change, last: int) -> Response:
         return Response(change.kind, start_s, end_s, None, None, NO_SETPOINT)
     period, turn = lane.sample_period, lane.turn
     if change.kind == "tracking":
-        if not lane.seen_late and last < len(lane.time) - 1:
-            r = np.append(r[:-1], r[-2])  # the window's last sample is the next change's first
+        if steps_at_end and not lane.seen_late:
+            r = np.append(r[:-1], r[-2])
         iae = integral_absolute_error(r, y, period, turn)
         return Response(change.kind, start_s, end_s, None, iae, "no single step")
     metrics: SetpointMetrics | DisturbanceMetrics

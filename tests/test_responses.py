@@ -78,9 +78,9 @@ def test_a_change_at_the_last_sample_has_no_response() -> None:
 
 def test_noise_on_the_first_output_is_no_step_of_the_setpoint() -> None:
     noisy = 0.02 * np.random.default_rng(1).standard_normal(N)
-    (response,) = responses(lane(np.zeros(N), noisy, np.ones(N), largest_step=1.0, noise_bound=0.12))
+    (response,) = responses(lane(np.zeros(N), noisy, np.ones(N), largest_step=1.0, begins=0.0))
     assert response.kind == "disturbance"
-    (response,) = responses(lane(np.ones(N), 1.0 - np.exp(-TIME) + noisy, noise_bound=0.12))
+    (response,) = responses(lane(np.ones(N), 1.0 - np.exp(-TIME) + 10.0 * noisy, begins=0.0))
     assert response.kind == "setpoint"
 
 

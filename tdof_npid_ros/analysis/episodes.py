@@ -108,6 +108,13 @@ class Episode:
         """Type of the controller; empty where the bag does not tell."""
         return ", ".join(dict.fromkeys(gains.type for gains in self.gains))
 
+    @property
+    def _begins(self) -> float | None:
+        """The output at which a plan begins, as far as it or the plant tells."""
+        if self.plan is not None and self.plan.start is not None:
+            return self.plan.start
+        return _told_initial_output(self.plant)
+
     def lane(self, lane: int) -> Lane:
         """What drives one lane and what it does."""
         segments = self.plan.sampled(self.sample_period_ns).segments[1:] if self.plan is not None else ()
@@ -122,7 +129,7 @@ class Episode:
             disturbance_is_new=self.from_rest,
             seen_late=self.plan is None,
             largest_step=self.largest_step,
-            noise_bound=_noise_bound(self.plant) if self.plan is not None else 0.0,
+            begins=None if self.plan is None else self._begins,
             turn=self.turn[lane],
         )
 
@@ -513,11 +520,18 @@ def _largest_step(
 
 def _initial_output(plant: Mapping[str, object], output: np.ndarray) -> float:
     """Where the plant starts: of its model, or else what was recorded first."""
+    if (told := _told_initial_output(plant)) is not None:
+        return told
+    known = output[~np.isnan(output)]
+    return float(known[0]) if known.size else 0.0
+
+
+def _told_initial_output(plant: Mapping[str, object]) -> float | None:
+    """The output with which a plant begins; None where the bag does not tell, or each lane has its own."""
     try:
         return float(make_plant(str(plant["model"]), plant).initial_output)
     except (KeyError, ValueError):
-        known = output[~np.isnan(output)]
-        return float(known[0]) if known.size else 0.0
+        return None
 
 
 def _noise_bound(plant: Mapping[str, object]) -> float:

@@ -246,6 +246,7 @@ class ScenarioNode(LoopNode):
             return True
         if self.placing is not None and "start" in self.placing.answer:
             self.refuse("rejected", "the plant cannot begin at rest", f": {self.placing.answer['start']}")
+            self.placed_at = math.nan  # so it is asked again
         self.zero_ns = self.ros_ns
         self._publish("setpoint", 0, plan.start)
         self.setpoint_told_ns = self.setpoint_told_ns or STEADY.now().nanoseconds

@@ -192,7 +192,8 @@ def _applied(reader: BagReader, loop: ObservedLoop, key: Key, chosen: Chosen) ->
 
 def _during(track: Track, output: Track, part: slice) -> Track:
     """What arrived while a part of the outputs did, where their stamps go back and so mean several times; else all."""
-    if not (np.diff(output.stamp_ns) < 0).any():
+    in_order = not (np.diff(output.receive_ns) < 0).any()
+    if not (track.has_header and in_order and (np.diff(output.stamp_ns) < 0).any()):
         return track
     until = output.receive_ns[part.stop] if part.stop < len(output) else np.iinfo(np.int64).max
     of_part = (track.receive_ns >= output.receive_ns[part.start]) & (track.receive_ns < until)

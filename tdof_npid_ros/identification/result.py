@@ -13,6 +13,7 @@ from tdof_npid_ros.draft import Draft, Process, significant
 from tdof_npid_ros.identification.identify import Identified
 from tdof_npid_ros.identification.records import Record
 from tdof_npid_ros.plants.plant import PlantError
+from tdof_npid_ros.responses import CLEAR_OF_NOISE
 
 DIGITS = 7  # of the plant's parameters in the file
 SMALLEST_STEP = 2.0**-6  # of the largest: a step that needs more effort than there is is halved, down to this
@@ -62,7 +63,7 @@ def draft_of(found: Identified, records: Sequence[Record], title: str, step: flo
         f"{found.fit_percent:.1f} % fit on data not used; noise {found.noise:.3g} (standard deviation).",
         *(f"{name}: {i.value:.5g}, 95 % between {i.low:.5g} and {i.high:.5g}" for name, i in found.parameters.items()),
     ]
-    largest = _largest_step(records) if step is None else step
+    largest = _largest_step(records, found.noise) if step is None else step
     step = largest
     while True:
         for signed in (step, -step):  # where the actuator is one-sided, only one way may be open
@@ -91,14 +92,18 @@ def _settled(value: float, found: Identified, effort: bool = False) -> float:
     return 0.0 if abs(value) < least else value
 
 
-def _largest_step(records: Sequence[Record]) -> float:
-    """The largest change of the setpoint; of the output, where no setpoint is known or moves."""
+def _largest_step(records: Sequence[Record], noise: float) -> float:
+    """The largest change of the setpoint; of the output, where no setpoint is known or moves.
+
+    A record that begins at rest begins with a change from there, as far as it is clear of the output's noise.
+    """
     steps = [
         np.diff(r.setpoint[np.isfinite(r.setpoint)], prepend=r.stretch.output[0] if r.stretch.at_rest else np.nan)
         for r in records
     ]
     sizes = np.abs(np.concatenate(steps))
-    sizes = sizes[np.isfinite(sizes)]
+    least = max(CLEAR_OF_NOISE * noise, 1e-6 * max(float(np.ptp(r.stretch.output)) for r in records))
+    sizes = np.where(sizes[np.isfinite(sizes)] > least, sizes[np.isfinite(sizes)], 0.0)
     largest = float(sizes.max(initial=0.0))
     if largest > 0.0 and np.sum(sizes > 0.5 * largest) <= 0.05 * len(sizes):
         return significant(largest, 3)

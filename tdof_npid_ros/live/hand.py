@@ -71,7 +71,7 @@ class Hand:
     def look(self) -> None:
         """Show what the controller has, and what was refused."""
         steering, recordings = self._view.loop.steering, self._view.loop.recordings
-        found = "; ".join(reason for name, reason in steering.problems.items() if name not in self._told)
+        found = "; ".join(reason for name, reason in list(steering.problems.items()) if name not in self._told)
         self._reason.update(text=html.escape(found), visible=bool(found))
         if steering.values and (
             self._shown.get("manual") != steering.values["manual"] or "manual" in steering.problems

@@ -73,6 +73,9 @@ def spreads_of(case: Case, texts: Sequence[str], sampling: Sampling = "uniform")
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
         raise RobustError(f"{twice} has two spreads: give one")
+    played = {name for signals in case.signals.values() for one in signals.segments for name in one.plant}
+    if fixed := next((name for name in names if name in played), None):
+        raise RobustError(f"{fixed} is what the episodes' plans set, so a spread of it would not be played")
     if not spreads:
         raise RobustError(f"no spread is given: say how far the plant may be from the model, as {FORMS}")
     return spreads

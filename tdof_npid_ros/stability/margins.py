@@ -15,7 +15,7 @@ from tdof_npid_ros.stability import StabilityError
 from tdof_npid_ros.stability.characteristic import Characteristic, characteristic
 from tdof_npid_ros.stability.plant import OperatingPoint, loop_plant, operating_point
 from tdof_npid_ros.stability.pulse import PulseTransfer
-from tdof_npid_ros.stability.screen import SMALLEST_MODE, Screen
+from tdof_npid_ros.stability.screen import Screen
 
 ON_BORDER = 1e-12  # distance of a mode to the circle, below which nobody can tell on which side it lies
 
@@ -133,8 +133,7 @@ def linear_margins(plant: PulseTransfer, gains: Gains) -> Margins:
         return Margins(None, "the effort does not move the output at this point")
     h, stable = plant.sample_period, bool(screened.stable[0])
     slow = float(screened.time_constant[0])
-    fastest = SMALLEST_MODE - 1.0  # at the most, where no slower mode was found: all are over within a sample or two
-    beyond = fastest if stable and slow == 0.0 else loop.radius(math.expm1(-h / slow) if stable else None)
+    beyond = loop.radius(math.expm1(-h / slow) if stable and slow > 0.0 else None)  # 0: no mode was found
     time_constant = -h / math.log1p(beyond) if abs(beyond) > ON_BORDER else None
     if not stable or beyond >= -ON_BORDER:
         return Margins(False, _unstable(beyond, h), spectral_radius=1.0 + beyond, time_constant_s=time_constant)

@@ -36,7 +36,6 @@ _PEAK_STEPS = 24  # at most, towards the top of a peak
 _PEAK_WIDTH = 1e-4  # part of a peak's distance from 0 by which it may still be nearer
 _NEAREST = 1e-13  # to the circle that a mode may lie and still be told from one on it
 _STEPS = 30  # towards a mode
-SMALLEST_MODE = 0.1  # modulus: smaller ones are not looked for
 # Rows of the result: see LaneMargins.
 (_STABLE, _MS, _MT, _GAIN, _GAIN_LOW, _PHASE, _DELAY, _RADIUS) = range(8)
 _RESULTS = 8
@@ -391,7 +390,7 @@ def _mode(response: Any, w: Any, c: Any, found: Any, count: Any) -> Any:
     for _ in range(_STEPS):
         z = 1.0 + w
         size = _squared(z)
-        if not SMALLEST_MODE * SMALLEST_MODE < size < 100.0:
+        if not 0.01 < size < 100.0:
             break
         a, a1, a2 = _horner(response.a_polynomial, w)
         b, b1, b2 = _horner(response.b_polynomial, w)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -223,9 +223,12 @@ class TuningProblem:
         low, high = (float(case.gains.per_lane(name)[0]) for name in ("effort_min", "effort_max"))
         low, high = max(low, case.effort_limits[0]), min(high, case.effort_limits[1])
         for episode in EPISODES:
-            r, d = float(case.signals[episode].setpoint[-1]), float(case.signals[episode].disturbance[-1])
+            signals = case.signals[episode]
+            r, d = float(signals.setpoint[-1]), float(signals.disturbance[-1])
+            plant = {**case.plant_values, **signals.segments[-1].plant}  # as this episode leaves it
+            its_end = replace(case, plant_values=plant, episodes={})
             try:
-                effort = operating_point(case, self.base.with_values(kp=1.0, ki=1.0, kd=0.0), r, d).effort
+                effort = operating_point(its_end, self.base.with_values(kp=1.0, ki=1.0, kd=0.0), r, d).effort
             except StabilityError:
                 continue
             if effort is not None and not low <= effort <= high:

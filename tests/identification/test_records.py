@@ -148,6 +148,18 @@ def test_a_chosen_effort_is_that_of_the_same_episode(tmp_path: Path) -> None:
         np.testing.assert_allclose(record.stretch.effort, asked, rtol=1e-12)
 
 
+def test_noise_at_rest_is_no_step_of_the_setpoint(tmp_path: Path) -> None:
+    plant = {"model": "first_order", "gain": GAIN, "time_constant": TIME_CONSTANT, "dead_time": 0.03, "noise": 0.01}
+    plans = {"disturbance": ["0 disturbance 2", "3 end"]}
+    case = make_case(plant, {"type": "pid", "kp": 0.5, "ki": 2.0}, plans, sample_period=0.01)
+    with LoopBag(tmp_path / "bag") as bag:
+        bag.configuration(case, case.gains)
+        bag.episode(case, case.gains, "disturbance", 1)
+    records = read_records([tmp_path / "bag"])
+    draft = draft_of(identify([record.stretch for record in records]), records, "a tank")
+    assert draft.step == pytest.approx(0.5 * float(np.ptp(records[0].stretch.output)), rel=0.1)
+
+
 def test_an_operating_point_is_no_step_of_the_setpoint(tmp_path: Path) -> None:
     _, bag = started(tmp_path / "bag")
     records = read_records([bag])

@@ -89,3 +89,10 @@ def test_too_many_samples_or_corners_are_refused() -> None:
         samples(spreads_of(case, ["gain 1 %"]), 0, "uniform", 0)
     with pytest.raises(RobustError, match="corners"):
         samples(spreads_of(case, ["gain 1 %"]) * 17, 1, "corners", 0)
+
+
+def test_what_the_plans_set_has_no_spread() -> None:
+    plans = {"setpoint": ["0 setpoint 1", "0 plant.gain 2", "25 end"], "disturbance": ["0 disturbance 1", "25 end"]}
+    case = make_case({"model": "first_order", "gain": 1.0, "dead_time": 0.1}, {"type": "pid", "kp": 1.0}, plans)
+    with pytest.raises(RobustError, match="gain is what the episodes' plans set"):
+        spreads_of(case, ["gain 20 %"])

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tdof_npid_ros import margins, tune
-from tdof_npid_ros.case import load_case
+from tdof_npid_ros.case import load_case, make_case
 from tdof_npid_ros.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from tdof_npid_ros.paper.tuned import tuned
 from tdof_npid_ros.tuning.objective import Objective
@@ -226,3 +226,15 @@ def test_a_loop_with_forty_lanes_needs_few_generations() -> None:
             study.tell(objective(study.ask()))
         generations.append(study.generation)
     assert np.median(generations) <= 20
+
+
+def test_each_episode_is_judged_with_the_plant_that_its_own_plan_leaves() -> None:
+    plans = {
+        "setpoint": ["0 setpoint 1", "0 plant.gain 0.1", "25 end"],
+        "disturbance": ["0 start 1", "0 setpoint 1", "0 disturbance 1", "25 end"],
+    }
+    limits = {"effort_min": -5.0, "effort_max": 5.0}
+    bounds = {f"bounds.{name}": [0.1, 10.0] for name in ("kp", "ki", "kd")}
+    plant = {"model": "first_order", "gain": 1.0, "dead_time": 0.1, **limits}
+    case = make_case(plant, {"type": "pid", "kp": 1.0, "ki": 1.0, **limits}, plans, tuner=bounds)
+    assert list(TuningProblem(case, "pid").restless) == ["setpoint"]

@@ -131,7 +131,7 @@ class AlternateLoop:
             time.sleep(POLL)
         found = self._controller.parameters([*GAIN_NAMES, "joint_names"])
         good = gains_from_mapping(found)
-        if good.integral_min == good.integral_max:
+        if good.integral_min == good.integral_max != 0.0:  # of 0, somebody wants no integral action
             raise TuningError(
                 f"{self._controller.name} has integral_min and integral_max {good.integral_min:g}, as a tuner that was "
                 "killed leaves them: set both as they were, -inf and inf for instance, and the gains, then start again"

@@ -218,7 +218,10 @@ class TunerNode(LoopNode):
         if failure is not None:
             if left[0] is None:
                 raise failure
-            self._write_result(left[0])
+            try:
+                self._write_result(left[0])
+            except (ValueError, OSError) as unwritten:
+                raise TuningError(f"{failure}; and {unwritten}") from failure
             raise TuningError(f"{failure}; {self._left(*left)}") from failure
         if self.study.done:
             self.study.require_feasible()
