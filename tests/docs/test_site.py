@@ -50,6 +50,7 @@ def marked_blocks() -> dict[str, list[str]]:
 OVER_ROS = ("run", "analyze", "verify", "live", "commission")  # what tests/graph runs
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", marked_blocks())
 def test_marked_commands_run_one_after_the_other(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -88,6 +88,9 @@ def test_an_imu_drives_and_the_effort_goes_to_a_forward_command_controller(graph
     recorder = graph.start("recorder", bag=str(tmp_path / "bag"))
     graph.wait_for_nodes("/controller", "/recorder")
     assert "waiting for /imu/data" in controller.log
+    listeners = {"/output": 1, "/control_effort": 2}  # the recorder, which must have the first answer
+    graph.wait_until(lambda: all(graph.node.count_subscribers(t) >= n for t, n in listeners.items()), what="a listener")
+    graph.wait_for_nodes("/controller", "/recorder")  # a second later it has met the controller, too
     sensor = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     imu, goal = graph.publisher("/imu/data", Imu, sensor), graph.publisher("/goal", Float64)
     message = Imu(angular_velocity=Vector3(z=0.25))
