@@ -34,9 +34,8 @@ NOTES = (
     "which lay 2.9 and 4.4 % too high from two seeds. That two agree takes 53 to 56 generations.",
     "A whole run is 120 episodes of 5,001 outputs in lockstep, one after the other: the loop's steps per second "
     "bound it. "
-    "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages the "
-    "run took "
-    "121 s.",
+    "The tuner empties the outputs in batches, every 5 ms. Signals are read and written as bytes; with messages a "
+    "whole run took 121 s on fast cores, with bytes 80.",
 )
 
 NAMESPACE = "/bench_tuning"

@@ -30,7 +30,7 @@ NOTES = (
     "5 ms, 8 % more steps/s). Answers are published before all bookkeeping.",
     "What bounds it: DDS and the waking of the other process, as the unread ping-pong shows; plant and controller "
     "take the rest, in Python, which weighs the more the slower a core is: against the unread ping-pong 0.72, 0.73 and "
-    "0.68 on a processor with AVX-512, 0.57, 0.52 and 0.51 on one without. Of 390 us a step there the two nodes take "
+    "0.68 on a processor with AVX-512, 0.51 to 0.63 on one without. Of 390 us a step there the two nodes take "
     "170. Recorded, a third process wants its share of the two cores. Tried without a measurable gain: shared memory "
     "(the nodes use UDP, for its safe restarts; the ping-pong has both), no piggybacked heartbeats, "
     "`spin_until_future_complete` in place of `spin_once`. "

@@ -64,7 +64,7 @@ def _head(results: Mapping[str, Result]) -> list[str]:
         lines += [f"| {v.claim} | {_number(v.reached)} | {v.limit} | {v.word} |" for v in result.verdicts]
     lines += [
         "",
-        "All of it again: `make bench` (some 40 minutes on two fast cores, twice that on slow ones) writes this page; "
+        "All of it again: `make bench` (less than an hour on two slow cores, less on fast ones) writes this page; "
         "`python -m benchmarks --only NAME` renews one section. `make bench-long` renews what takes too long for "
         "that: seeds, the plants from forums and the soak.",
         "",
