@@ -121,7 +121,7 @@ class Case:
         """Of output and effort, as far as the plant's parameters tell."""
         return Units.of(self.plant_values)
 
-    @property
+    @cached_property
     def noise_bound(self) -> float:
         """How far a measured output is from the plant's at the most, in the output's unit."""
         return largest_noise(self.plant_at({}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -108,12 +109,12 @@ class Episode:
         """Type of the controller; empty where the bag does not tell."""
         return ", ".join(dict.fromkeys(gains.type for gains in self.gains))
 
-    @property
+    @cached_property
     def _begins(self) -> float | None:
-        """The output at which a plan begins, as far as it or the plant tells."""
-        if self.plan is not None and self.plan.start is not None:
-            return self.plan.start
-        return _told_initial_output(self.plant)
+        """The output at which its plan begins, as far as that or the plant tells; None without a plan."""
+        if self.plan is None:
+            return None
+        return _told_initial_output(self.plant) if self.plan.start is None else self.plan.start
 
     def lane(self, lane: int) -> Lane:
         """What drives one lane and what it does."""
@@ -129,7 +130,7 @@ class Episode:
             disturbance_is_new=self.from_rest,
             seen_late=self.plan is None,
             largest_step=self.largest_step,
-            begins=None if self.plan is None else self._begins,
+            begins=self._begins,
             turn=self.turn[lane],
         )
 

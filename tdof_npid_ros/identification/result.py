@@ -103,7 +103,8 @@ def _largest_step(records: Sequence[Record], noise: float) -> float:
     ]
     sizes = np.abs(np.concatenate(steps))
     least = max(CLEAR_OF_NOISE * noise, 1e-6 * max(float(np.ptp(r.stretch.output)) for r in records))
-    sizes = np.where(sizes[np.isfinite(sizes)] > least, sizes[np.isfinite(sizes)], 0.0)
+    sizes = sizes[np.isfinite(sizes)]
+    sizes[sizes <= least] = 0.0
     largest = float(sizes.max(initial=0.0))
     if largest > 0.0 and np.sum(sizes > 0.5 * largest) <= 0.05 * len(sizes):
         return significant(largest, 3)

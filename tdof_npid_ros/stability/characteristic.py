@@ -85,7 +85,7 @@ class Characteristic:
         """
         if guess is not None:
             low, high = guess - SURE * abs(guess), guess + SURE * abs(guess)
-            if (low <= -1.0 or self._outside(low)) and not self._outside(high):
+            if low > -1.0 and self._outside(low) and not self._outside(high):
                 return guess
         grows = self._outside(0.0)
         sign = 1.0 if grows else -1.0

@@ -108,7 +108,8 @@ def loop_plant(case: Case, point: OperatingPoint | None = None) -> PulseTransfer
 
 def linear_loop_plants(case: Case, changes: Sequence[Mapping[str, Any]]) -> list[PulseTransfer]:
     """`loop_plant` of a case with a linear plant, for each set of changed parameters."""
-    plants = [noiseless(case.plant_at({**changed, **case.set_by_plan})) for changed in changes]
+    played = case.set_by_plan
+    plants = [noiseless(case.plant_at({**changed, **played})) for changed in changes]
     linear = [plant for plant in plants if isinstance(plant, TransferFunction)]
     assert len(linear) == len(plants)
     return [_linear(case, sampled) for sampled in sampled_lanes(linear, case.sample_period_ns)]
