@@ -158,7 +158,8 @@ class _Outputs:
         recorded = [(int(answers.stamp_ns[step]), np.asarray(answers.effort[step], dtype=np.float64)) for step in mine]
         allowed: dict[int, dict[bytes, float]] = {}
         is_start = True  # until the first effort
-        is_joined = run.first == 0 and int(output.sequence[0]) != 1  # and until the first effort that is in the bag
+        began_before = int(output.sequence[0]) != 1 or int(answers.sequence[0]) != 1
+        is_joined = run.first == 0 and began_before  # and until the first effort that is in the bag
         for i in range(run.first, run.stop):
             applied = np.asarray(output.effort[i], dtype=np.float64)
             if not applied.size:

@@ -185,7 +185,7 @@ class Hold:
             stack.enter_context(afterwards())
             check()
             self.taken, self._seen = self._observer.rows_since(max(0, self._observer.count - REST_SAMPLES))
-            self._set(self._settings)
+            self._set({})
             stack.callback(self._end)
             self._stack = stack.pop_all()
         return self
@@ -275,8 +275,10 @@ class Hold:
             self._tell(new[-1].time - begun)
 
     def _set(self, values: Mapping[str, Any], named: bool = True) -> None:
+        """Named, with the safe ranges each time: a controller that was started again knows neither."""
+        named_settings = {"experiment": self.name, **self._settings} if named else {}
         try:
-            self._controller.set_parameters({**({"experiment": self.name} if named else {}), **values})
+            self._controller.set_parameters({**named_settings, **values})
         except NoAnswerError as error:
             self._ended = True
             raise ExperimentError(f"{error}: the controller ends the experiment by itself") from None

@@ -25,6 +25,7 @@ from tdof_npid_ros.stability.margins import Margins, margins
 
 LOOK_PERIOD = 1.0  # s between two looks at the parameters: somebody else may change them, too
 MOST_MARGINS = 16  # lanes of which margins are computed
+_Step = Callable[[GainHistory], dict[str, Any] | None]
 CONTROLLER_NAMES = (*GAIN_NAMES, *OPTION_NAMES, "sample_period", "setpoint")
 
 
@@ -71,11 +72,11 @@ class Steering:
 
     def undo(self) -> None:
         """The gains before."""
-        self._again(self.history.undo() if self.history else None)
+        self._tasks.put(lambda: self._step(GainHistory.undo, GainHistory.redo))
 
     def redo(self) -> None:
         """The gains that were undone."""
-        self._again(self.history.redo() if self.history else None)
+        self._tasks.put(lambda: self._step(GainHistory.redo, GainHistory.undo))
 
     def reset(self) -> None:
         """Let the plant begin once more."""
@@ -148,13 +149,14 @@ class Steering:
         if self.history is not None:
             self.history.note(self._gains())
 
-    def _again(self, gains: Mapping[str, Any] | None) -> None:
-        if gains is not None:
-            self._tasks.put(lambda: self._restore(dict(gains)))
-
-    def _restore(self, gains: dict[str, Any]) -> None:
+    def _step(self, step: _Step, back: _Step) -> None:
+        """A step in the history, and back again where the controller refuses it."""
+        if self.history is None or (gains := step(self.history)) is None:
+            return
         if self._try("undo", lambda: self._observer.remote("controller").set_parameters(gains)):
             self.values |= gains
+        else:
+            back(self.history)
 
     def _gains(self) -> dict[str, Any]:
         return {name: self.values[name] for name in ("type", *PER_LANE)}

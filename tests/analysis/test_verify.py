@@ -229,7 +229,7 @@ def test_a_loop_with_labels_begins_at_each_that_is_new_whatever_the_stamp(tmp_pa
     assert verify.verify(tmp_path / "bag").equal == 300
 
 
-def realtime_bag(folder, case, step, applied, limit=2.0, first=0) -> None:
+def realtime_bag(folder, case, step, applied, limit=2.0, first=0, first_effort=0) -> None:
     """Thirty outputs of a plant in realtime, from the first one recorded on, that of `step` with another applied
     effort."""
     limited = replace(case, effort_limits=(-limit, limit))
@@ -246,6 +246,9 @@ def realtime_bag(folder, case, step, applied, limit=2.0, first=0) -> None:
                 bag.skip("output"), bag.skip("control_effort")
                 continue
             bag.write("output", JOINT_STATE, joint_state(stamp, "-/0011aabb.1", y, [told]))
+            if k < first_effort:
+                bag.skip("control_effort")
+                continue
             answer = joint_state(stamp, f"{controller.digest} -/0011aabb.1", [1.0], controller.effort)
             bag.write("control_effort", JOINT_STATE, answer)
 
@@ -288,6 +291,14 @@ def test_an_effort_of_before_the_recording_is_not_checked_and_not_different(tmp_
     assert not account.differs and account.unchecked == {BEFORE_THE_BAG: 1}
     assert account.checks[APPLIED].equal == 19
     realtime_bag(tmp_path / "other", case, 20, lambda it: 1e6, 1e3, first=10)
+    assert verify.verify(tmp_path / "other").status == 1
+
+
+def test_efforts_that_the_recorder_came_too_late_for_are_not_checked_and_not_different(tmp_path, case) -> None:
+    realtime_bag(tmp_path / "bag", case, 20, lambda it: it, 1e3, first_effort=11)
+    account = verify.verify(tmp_path / "bag")
+    assert not account.differs and account.unchecked[BEFORE_THE_BAG] == 11
+    realtime_bag(tmp_path / "other", case, 20, lambda it: 1e6, 1e3, first_effort=11)
     assert verify.verify(tmp_path / "other").status == 1
 
 

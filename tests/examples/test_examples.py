@@ -58,6 +58,7 @@ def test_a_plant_of_one_s_own_is_driven_and_recorded(tmp_path: Path) -> None:
     assert position[0] == 0.0 and abs(position[-1] - 0.5) < 0.01
 
 
+@pytest.mark.alone  # on a busy machine best-effort messages are lost
 @pytest.mark.timeout(300)
 def test_an_arm_s_joints_are_held_then_driven(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install '.[examples]'")

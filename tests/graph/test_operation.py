@@ -497,7 +497,7 @@ def test_a_loop_that_was_driven_off_is_told_and_brought_back_by_full_unwinding(g
     assert "set full_unwinding" in controller.log and controller.log.count("was driven off") == 1
     assert graph.set_parameters("/controller", full_unwinding=True)[0].successful
     until(lambda: efforts[-1].effort[0] > -595.0, "the integral action to unwind")
-    until(lambda: graph.fact("/controller", "message") == "running", "that all is well")
+    graph.wait_until(lambda: graph.fact("/controller", "message") == "running", 30, "that all is well")
 
 
 def test_a_second_publisher_and_a_profile_that_does_not_fit_are_reported(graph: Any) -> None:

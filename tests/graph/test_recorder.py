@@ -264,6 +264,19 @@ def test_a_vanished_folder_is_told_at_once_and_the_loop_goes_on(graph: Any, tmp_
     graph.wait_for_log(recorder, "recording stopped")
     graph.wait_until(lambda: graph.fact("/recorder", "level") == 2, 20, "an error in the diagnostics")
     graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 120, "the loop to go on to its end")
+    recorder.expected_status = 1
+
+
+def test_a_plant_that_begins_after_its_recorder_has_given_up_does_not_wait(graph: Any, tmp_path: Path) -> None:
+    graph.start("controller", case=CASE)
+    recorder = graph.start("recorder", bag=str(tmp_path / "bag"), lossless=True)
+    recorder.expected_status = 1
+    graph.wait_for_nodes("/controller", "/recorder")
+    shutil.rmtree(tmp_path / "bag")
+    graph.wait_for_log(recorder, "recording stopped")
+    graph.start("plant", case=CASE, lossless=True)
+    graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "25 end"])
+    graph.wait_until(lambda: graph.fact("/plant", "state") == "finished", 120, "the loop to end")
 
 
 def test_a_full_disk(graph: Any, tmp_path: Path) -> None:
@@ -281,6 +294,7 @@ def test_a_full_disk(graph: Any, tmp_path: Path) -> None:
         graph.start("scenario", case=CASE, episodes=["run"], plan__run=["0 setpoint 1", "60 end"])
         graph.wait_for_log(recorder, "recording stopped", 60)
         assert "No space left" in recorder.log
+        recorder.expected_status = 1
         recorder.stop()
         with BagReader(disk / "bag") as reader:
             assert len(reader.columns("/output")["log_time"]) > 100

@@ -13,6 +13,7 @@ pytest.importorskip("rclpy")
 
 from tdof_npid_ros.control.gains import GAIN_NAMES, Gains
 from tdof_npid_ros.control.options import OPTION_NAMES, ControllerOptions
+from tdof_npid_ros.graph.runtime.parameter_client import RefusedError
 from tdof_npid_ros.live import steering as module
 from tdof_npid_ros.live.steering import Steering
 from tdof_npid_ros.live.tune_controls import TuneControls
@@ -89,6 +90,26 @@ def test_undo_brings_the_type_back_with_its_gains(played: Played) -> None:
     eventually(lambda: now() == ("tdof_npid2", 2.0), now, 60.0)
     played.steering.redo()
     eventually(lambda: now() == ("pid", 0.5), now, 60.0)
+
+
+def test_an_undo_that_is_refused_leaves_what_can_be_undone_and_redone(played: Played) -> None:
+    def refuse() -> None:
+        raise RefusedError("/controller refused kp: not now")
+
+    for kp in (3.0, 4.0):
+        played.steering.change({"kp": kp})
+    played.steering.undo()
+    kp = lambda: played.controller.values["kp"]  # noqa: E731
+    eventually(lambda: kp() == 3.0, kp, 60.0)
+    played.controller.before_setting = refuse
+    played.steering.undo()
+    eventually(lambda: "undo" in played.steering.problems, "the reason", 60.0)
+    played.controller.before_setting = lambda: None
+    played.steering.redo()
+    eventually(lambda: kp() == 4.0, kp, 60.0)
+    for _ in range(3):
+        played.steering.undo()
+    eventually(lambda: kp() == 2.0, kp, 60.0)
 
 
 def test_gains_that_were_found_are_applied_with_the_type_they_were_found_for(played: Played) -> None:

@@ -127,6 +127,10 @@ class RecorderNode(LoopNode):
             failure = f"; {self.failure}" if self.failure else ""
             print(f"bag {self.folder}: {account['recorded']} messages, {account['lost']} lost{failure}", flush=True)
 
+    def finished(self, status: int) -> int:
+        """A bag that could not be written whole is no success."""
+        return max(status, 1) if self.failure else status
+
     def checked(self, changes: dict[str, Any]) -> None:
         """Refuse another folder while recording."""
         if "bag" in changes:
@@ -149,6 +153,7 @@ class RecorderNode(LoopNode):
     def _discover(self) -> None:
         if self.failure:
             self._let_go()
+            self._tell_failure()
             return
         self._look()
         calm = self.calm_looks >= CALM_LOOKS
@@ -274,13 +279,16 @@ class RecorderNode(LoopNode):
     def _fail(self, error: BagError) -> None:
         """Say so at once, and let go of the topics: a reader that does not read would hold the loop up."""
         self.failure = str(error)
-        if self.lossless:
-            self._tell_progress(NO_LOG, 0)
+        self._tell_failure()
         self.get_logger().error(self.failure)
         self.publish_diagnostics()
 
+    def _tell_failure(self) -> None:
+        """Again and again: a plant that begins later must not wait for a log, either."""
+        if self.lossless:
+            self._tell_progress(NO_LOG, 0)
+
     def _let_go(self) -> None:
-        self.discovery.cancel()
         for topic in list(self.taps):
             self._close(topic)
 
