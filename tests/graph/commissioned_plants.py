@@ -84,7 +84,7 @@ LOOPS = {
     "tank": Loop({"model": "commissioned_plants:Tank", "noise": 0.002}, (40.0, 2.0), 1.0, (0.4, 1.8), 0.2, PER_CENT),
     "inverse response": Loop(
         {"model": "third_order", "gain": 1.0, "time_constant": 5.0, "zero_time_constant": 3.0, "noise": 0.003},
-        (0.3, 0.02), 0.0, (-3.0, 3.0), 1.0,
+        (0.3, 0.02), 0.0, (-3.0, 3.0), 1.0, speed=40.0,
     ),
     "strong inverse response": Loop(
         {"model": "third_order", "gain": 2.0, "time_constant": 8.0, "zero_time_constant": 8.0, "noise": 0.003},
