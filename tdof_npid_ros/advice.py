@@ -18,7 +18,7 @@ from tdof_npid_ros.plants.linear import TransferFunction
 from tdof_npid_ros.plants.linearise import linearised
 from tdof_npid_ros.plants.ode import Ode
 from tdof_npid_ros.plants.plant import PlantError
-from tdof_npid_ros.stability.margins import margins, one_lane
+from tdof_npid_ros.stability.margins import Margins, margins, one_lane
 
 Severity = Literal["error", "warning", "hint"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "hint")
@@ -51,8 +51,11 @@ class Advice(NamedTuple):
         return f"{self.about}: {self.text}: {self.remedy}"
 
 
-def advice(case: Case) -> list[Advice]:
+def advice(case: Case, its_margins: Margins | None = None) -> list[Advice]:
     """All that is to be said of a case, the gravest first; of each lane where each has a plant of its own.
+
+    Args:
+        its_margins: of its gains, where they are known already.
 
     Example:
         >>> from tdof_npid_ros.case import load_case
@@ -68,6 +71,8 @@ def advice(case: Case) -> list[Advice]:
         return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
     for look in LOOKS_AT_THE_FILE:
         found += look(case)
+    if case.gains.lanes == 1:
+        found += _margins(its_margins or margins(case, case.gains))
     if not any(one.severity == "error" for one in found):
         for name in case.plans:
             run = case.simulate(name)
@@ -206,10 +211,7 @@ def _angles(case: Case) -> Iterator[Advice]:
         )  # fmt: skip
 
 
-def _margins(case: Case) -> Iterator[Advice]:
-    if case.gains.lanes > 1:
-        return
-    found = margins(case, case.gains)
+def _margins(found: Margins) -> Iterator[Advice]:
     if found.stable is False:
         yield Advice("error", "gains", f"the loop is unstable ({found.reason})", "take smaller gains, or tune")
     elif found.m_s is not None and found.m_s > USUAL_M_S:
@@ -221,7 +223,7 @@ def _margins(case: Case) -> Iterator[Advice]:
 
 
 LOOKS_AT_THE_FILE: tuple[Callable[[Case], Iterator[Advice]], ...] = (
-    _integration, _sample_period, _sigma, _limits, _reach, _margins, _bounds, _angles,
+    _integration, _sample_period, _sigma, _limits, _reach, _bounds, _angles,
 )  # fmt: skip
 
 
@@ -282,6 +284,6 @@ def _approaches(run: Trajectory) -> bool:
     return bool(error[-third:].max() < 0.7 * error[third : 2 * third].max()) if third else False
 
 
-def gravest(case: Case) -> Advice | None:
+def gravest(case: Case, its_margins: Margins | None = None) -> Advice | None:
     """What `simulate` and `tune` warn of: the gravest finding that is more than a hint."""
-    return next((one for one in advice(case) if one.severity != "hint"), None)
+    return next((one for one in advice(case, its_margins) if one.severity != "hint"), None)

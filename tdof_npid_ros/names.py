@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import get_close_matches
 
 
 def in_namespace(namespace: str, name: str = "") -> str:
@@ -31,5 +30,7 @@ def meant_hint(name: str, known: Iterable[str]) -> str:
     >>> meant_hint("simulat", ["simulate", "tune"]), meant_hint("kpp", ["kp", "ki"]), meant_hint("xyz", ["kp"])
     (': simulate is meant?', ': kp is meant?', '')
     """
+    from difflib import get_close_matches  # only where something is misspelt: it takes its time to import
+
     like = get_close_matches(name, known, 1)
     return f": {like[0]} is meant?" if like else ""

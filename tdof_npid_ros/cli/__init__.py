@@ -9,13 +9,15 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import NoReturn
 
-from tdof_npid_ros import __version__
+from tdof_npid_ros import TYPE_CHECKING, __version__
 from tdof_npid_ros.graph import NEEDS_ROS, ros_is_missing
 from tdof_npid_ros.names import meant_hint
 from tdof_npid_ros.one_line import one_line
 from tdof_npid_ros.streams import prepare_streams
+
+if TYPE_CHECKING:
+    from typing import NoReturn
 
 # Name, and its one line of help. The module is cli.<name>: add_arguments(parser) and run(arguments) -> exit status.
 SUBCOMMANDS = {

@@ -24,7 +24,7 @@ from tdof_npid_ros.output_file import check_outputs
 from tdof_npid_ros.parameter_file import find_parameter_file
 from tdof_npid_ros.plotting import Panel, draw_responses
 from tdof_npid_ros.prediction import gains_table, measured, numbers, panels, shown, simulated
-from tdof_npid_ros.stability.margins import margins
+from tdof_npid_ros.stability.margins import Margins, margins
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     case = load_case(arguments.case)
     gains = chosen_gains(case, arguments)
     found = margins(case, gains)
-    report = response_report(case, gains) | {"margins": found.as_dict()} | advised(case, gains)
+    report = response_report(case, gains) | {"margins": found.as_dict()} | advised(case, gains, found)
     write_responses(case, {title(gains): gains}, arguments)
     lines = [headline(case, gains), *_table(report), *(f"  margins      {line}" for line in found.lines())]
     lines += written(outputs_of(arguments))
@@ -118,9 +118,9 @@ def response_report(case: Case, gains: Gains) -> dict[str, Any]:
     }
 
 
-def advised(case: Case, gains: Gains) -> dict[str, Any]:
+def advised(case: Case, gains: Gains, its_margins: Margins | None = None) -> dict[str, Any]:
     """Warn of the gravest finding with these gains, if there is one; the same as a key for the JSON object."""
-    found = gravest(replace(case, gains=gains))
+    found = gravest(replace(case, gains=gains), its_margins)
     if found is None:
         return {}
     warnings.warn(found.line(), stacklevel=2)

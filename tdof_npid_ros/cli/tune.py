@@ -146,7 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = response_report(problem.case, result.gains)
     report |= {"evaluations": result.evaluations, "elapsed_s": round(time.monotonic() - started, 3)}
     report |= _search_report(study) | {"margins": found.as_dict(), "price": _price(problem, result, found)}
-    report |= advised(problem.case, result.gains)
+    report |= advised(problem.case, result.gains, found)
     if unseen is not None:
         report |= {"robust": _robust_report(problem, result.objective, unseen)}
     if arguments.out:

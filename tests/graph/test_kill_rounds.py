@@ -141,6 +141,7 @@ def test_in_lockstep_every_bit_is_as_in_process(graph: Any, tmp_path: Path) -> N
 @pytest.mark.timeout(60 + 40 * ROUNDS)
 def test_in_realtime_the_output_comes_back(graph: Any, tmp_path: Path) -> None:
     from sensor_msgs.msg import JointState
+    from std_srvs.srv import Trigger
 
     outputs, efforts = graph.collect("output", JointState), graph.collect("control_effort", JointState)
     loop = Recorded(graph, tmp_path, {
@@ -160,6 +161,8 @@ def test_in_realtime_the_output_comes_back(graph: Any, tmp_path: Path) -> None:
             30.0, "the output to come back",
         )  # fmt: skip
 
+    settle()
+    assert graph.call("plant/reset", Trigger).success  # of this episode the recorder has the beginning
     settle()
     for node, number in drawn_rounds():
         loop.harm(node, number, rng.uniform(0.05, 0.6))
