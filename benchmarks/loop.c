@@ -6,7 +6,7 @@
 
    Standard input: steps, runs, steps until the setpoint goes from 1 to 0 and back, delay in samples, phi, gamma_old, gamma_new, eight coefficients of the law, five limits,
    two limits of the plant. The lanes differ in kp. Prints the best run's steps per second, then the first lane's sum
-   of absolute errors. */
+   of absolute errors and its largest. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -16,7 +16,7 @@
 typedef struct { double phi[ORDER][ORDER], gamma_old[ORDER], gamma_new[ORDER]; } plant;
 typedef struct { double kp[LANES], ki_h[LANES], kd_h[LANES], phi[LANES], alpha[LANES], beta[LANES], q[LANES], tracking[LANES]; } law;
 typedef struct { double u_min, u_max, i_min, i_max, conditional, low, high; } limits;
-typedef struct { double x[ORDER][LANES], u_i[LANES], z[LANES], sum[LANES], sound[LANES]; } state;
+typedef struct { double x[ORDER][LANES], u_i[LANES], z[LANES], sum[LANES], sound[LANES], largest[LANES]; } state;
 
 static double now(void) {
     struct timespec t;
@@ -80,6 +80,7 @@ __attribute__((noinline)) static state run(long steps, long delay, plant p, cons
             for (int i = 0; i < ORDER; i++) s.x[i][j] = bounded ? moved[i] : s.x[i][j];
             s.sum[j] += weight[k] * fabs(e);
             s.sound[j] += fabs(y) < 1e12 ? 1.0 : 0.0;
+            s.largest[j] = fabs(e) > s.largest[j] ? fabs(e) : s.largest[j];
         }
         slot = oldest;
     }
@@ -107,15 +108,16 @@ int main(void) {
     for (int j = 1; j < LANES; j++) c.kp[j] *= 1 - 0.1 * j / LANES;
     for (int i = 0; i < 7; i++) ((double *)&m)[i] = number();
     double *r = malloc((steps + 1) * sizeof *r), *d = calloc(steps + 1, sizeof *d), *w = malloc((steps + 1) * sizeof *w);
-    double(*line)[LANES] = malloc((delay + 2) * sizeof *line), best = 1e9, sum = 0;
+    double(*line)[LANES] = malloc((delay + 2) * sizeof *line), best = 1e9, sum = 0, largest = 0;
     for (long k = 0; k <= steps; k++) r[k] = 1 - (k - (k == steps)) / every % 2, w[k] = k == 0 || k == steps ? 0.5 : 1.0;
     for (int i = 0; i < runs; i++) {
         memset(line, 0, (delay + 2) * sizeof *line);
         double start = now();
-        sum = run(steps, delay, p, &c, m, line, r, d, w).sum[0];
+        state end = run(steps, delay, p, &c, m, line, r, d, w);
         double taken = now() - start;
+        sum = end.sum[0], largest = end.largest[0];
         best = taken < best ? taken : best;
     }
-    printf("%.1f %.17g\n", LANES * (steps + 1) / best, sum);
+    printf("%.1f %.17g %.17g\n", LANES * (steps + 1) / best, sum, largest);
     return 0;
 }
