@@ -32,8 +32,8 @@ NOTES = (
     "On two slow cores two more loops answer after 5 s beside two, 19 s beside eight, 34 s beside ten, and 16 that "
     "start at once after 35 s to more than 110 s. See docs/fleets.md: a domain each, or a discovery server.",
     "Each process announces itself to all others, each half second for its first ten seconds, then every 3 s. When it "
-    "did so each half second for ever, 16 loops took 0.97 of a processor where they take 0.81 now, and the exponent "
-    "was 1.11.",
+    "did so each half second for ever, 16 loops took 0.97 of a processor where they take 0.81 to 0.89 now, and the "
+    "exponent was 1.11.",
 )
 
 PERIOD = 0.05  # s
