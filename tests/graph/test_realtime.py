@@ -76,26 +76,51 @@ def test_stamps_are_ros_time_on_one_grid_and_go_on_over_a_reset(graph: Any) -> N
     assert not graph.node.get_publishers_info_by_topic("/clock")
 
 
+class Ticked:
+    """A plant in realtime of which each tick comes when it is told to, in ns, and the stamps of its outputs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        from tdof_npid_ros.graph.plant import realtime
+
+        self._monkeypatch, self._module = monkeypatch, realtime
+        self.stamps: list[int] = []
+        settings = {"effort_timeout": 0.0, "fallback": "hold", "fallback_effort": 0.0, "return_time": 0.0}
+        self.node = SimpleNamespace(counts=Counter(), values_of=lambda names: settings)
+        simulator = SimpleNamespace(lanes=1, applied_effort=np.zeros(1), advance=lambda effort, disturbance: None)
+        port = SimpleNamespace(
+            node=self.node, period_ns=10, simulator=simulator, publish_output=self.stamps.append,
+            publish_clock=lambda time_ns: None,
+        )  # fmt: skip
+        self.plant = realtime.RealtimePlant(port)  # type: ignore[arg-type]
+        self.plant.wall_period_ns, self.plant.due_from_ns = 10, 3
+        self.plant.clock_told_ns = self.plant.latest_stamp_ns = 0
+        self.plant.ros_time, self.plant.period_error = SteadyRosTime(10**18, 3), LatestTimes()
+        self.plant._start()
+
+    def tick(self, *times: int) -> None:
+        for now in times:
+            steady = SimpleNamespace(now=lambda now=now: SimpleNamespace(nanoseconds=now))
+            self._monkeypatch.setattr(self._module, "STEADY", steady)
+            self.plant._on_tick()
+
+
 def test_a_late_tick_shifts_no_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first one is stamped with the time at which it was due; those after it come a period later each."""
-    from tdof_npid_ros.graph.plant import realtime
+    ticked = Ticked(monkeypatch)
+    ticked.tick(46, 54, 63, 97, 103)  # due at 43, 53, 63, 73 (missed), 83 (missed), 93, 103
+    assert ticked.stamps == [10**18 + 40 + 10 * k for k in range(5)]
+    assert ticked.node.counts["missed_ticks"] == 2
 
-    stamps: list[int] = []
-    settings = {"effort_timeout": 0.0, "fallback": "hold", "fallback_effort": 0.0, "return_time": 0.0}
-    node = SimpleNamespace(counts=Counter(), values_of=lambda names: settings)
-    simulator = SimpleNamespace(lanes=1, applied_effort=np.zeros(1), advance=lambda effort, disturbance: None)
-    port = SimpleNamespace(
-        node=node, period_ns=10, simulator=simulator, publish_output=stamps.append, publish_clock=lambda time_ns: None
-    )
-    plant = realtime.RealtimePlant(port)  # type: ignore[arg-type]
-    plant.wall_period_ns, plant.due_from_ns, plant.clock_told_ns = 10, 3, 0
-    plant.ros_time, plant.period_error = SteadyRosTime(10**18, 3), LatestTimes()
-    plant._start()
-    for now in (46, 54, 63, 97, 103):  # due at 43, 53, 63, 73 (missed), 83 (missed), 93, 103
-        monkeypatch.setattr(realtime, "STEADY", SimpleNamespace(now=lambda now=now: SimpleNamespace(nanoseconds=now)))
-        plant._on_tick()
-    assert stamps == [10**18 + 40 + 10 * k for k in range(5)]
-    assert node.counts["missed_ticks"] == 2
+
+def test_stamps_grow_over_a_reset_also_after_a_first_tick_that_was_a_period_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ticked = Ticked(monkeypatch)
+    ticked.tick(54, 54, 63)  # due at 43, 53 and 63: the first two come together
+    ticked.plant._start()
+    ticked.tick(73, 83)
+    assert ticked.stamps == [10**18 + 50 + 10 * k for k in range(5)]
+    assert ticked.node.counts["missed_ticks"] == 0
 
 
 def test_with_use_sim_time_silence_counts_in_simulated_time(graph: Any) -> None:

@@ -35,7 +35,7 @@ class RealtimePlant:
         self.wall_period_ns = max(1, round(self._port.period_ns / speed))
         self.start_ns = node.get_clock().now().nanoseconds  # the stamp of step 0
         self.ros_time = SteadyRosTime(self.start_ns, STEADY.now().nanoseconds, speed)
-        self.clock_told_ns = 0
+        self.clock_told_ns = self.latest_stamp_ns = 0
         self._begin()
         node.subscribe_signal("control_effort", self._on_effort, node.requested_qos(as_promised=True), sole=True)
         node.subscribe_signal("disturbance", self._on_disturbance, node.requested_qos(1))
@@ -77,7 +77,10 @@ class RealtimePlant:
         node, now = self._node, STEADY.now().nanoseconds
         if self.first_tick_ns is None:
             self.first_tick_ns = now - (now - self.due_from_ns) % self.wall_period_ns  # when it was due
-            self.start_ns = self.ros_time.at(self.first_tick_ns)
+            due_ns = self.ros_time.at(self.first_tick_ns)
+            self.start_ns = max(
+                due_ns, self.latest_stamp_ns + self._port.period_ns
+            )  # each stamp is later than all before
             self.latest_tick_ns = now
             self.missed_ticks = 0
         else:
@@ -91,6 +94,7 @@ class RealtimePlant:
             self.step += 1
         stamp_ns = self.start_ns + self.step * self._port.period_ns
         self._port.publish_output(stamp_ns)
+        self.latest_stamp_ns = stamp_ns
         self.output_ns = stamp_ns, now
         if now - self.clock_told_ns >= CLOCK_PERIOD_NS:
             self.clock_told_ns = now
