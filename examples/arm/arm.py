@@ -23,7 +23,8 @@ from sensor_msgs.msg import JointState
 MODEL = Path(__file__).with_name("arm.xml")
 PERIOD_NS = 4_000_000  # 250 Hz
 SILENCE = 0.1  # s without efforts until the brakes close
-LISTENERS = 2  # that it waits for, a controller and a recorder: so the bag begins with the controller's first answer
+LISTENERS = 2  # that it waits for, a controller and a recorder
+MEETING = 250  # steps more, until these have met each other, too: so the bag begins with the controller's first answer
 AT_START = {"shoulder": -0.6, "elbow": 1.2}  # rad; the others at 0
 
 
@@ -43,6 +44,7 @@ class Arm(Node):
         self.stamp_ns = self.get_clock().now().nanoseconds
         self.heard_at = 0.0
         self.brakes_hold = True
+        self.to_wait = MEETING
         self.publisher = self.create_publisher(JointState, "joint_states", qos_profile_sensor_data)
         self.create_subscription(JointState, "efforts", self.on_efforts, qos_profile_sensor_data)
         self.create_timer(PERIOD_NS / 1e9, self.step)
@@ -58,6 +60,9 @@ class Arm(Node):
     def step(self) -> None:
         """Let 4 ms pass, and tell angles, speeds and torques."""
         if self.publisher.get_subscription_count() < LISTENERS:
+            return
+        if self.to_wait:
+            self.to_wait -= 1
             return
         if self.time - self.heard_at > SILENCE:
             self.brakes_hold = True
