@@ -390,7 +390,7 @@ def test_what_was_found_is_written_though_the_loop_is_lost(
     controller = loops.start("controller", case=case, namespace="/fleeting", program=program)
     controller.expected_status = None
     loops.wait_for_nodes("/fleeting/plant", "/fleeting/controller")
-    options = {**QUICK, "polish": 0, "loop_timeout": 2.0, "answer_timeout": 1.0, "result": str(result)}
+    options = {**QUICK, "polish": 0, "loop_timeout": 5.0, "answer_timeout": 1.0, "result": str(result)}
     process = loops.start("tuner", "-p", f"case:={case}", namespace="/fleeting", type="pid", seed=8, **options)
     process.expected_status = 2
     loops.wait_until(lambda: process.process.poll() is not None, 60, "the end of the tuner")
