@@ -118,7 +118,7 @@ def response_report(case: Case, gains: Gains) -> dict[str, Any]:
     }
 
 
-def advised(case: Case, gains: Gains, its_margins: Margins | None = None) -> dict[str, Any]:
+def advised(case: Case, gains: Gains, its_margins: Margins) -> dict[str, Any]:
     """Warn of the gravest finding with these gains, if there is one; the same as a key for the JSON object."""
     found = gravest(replace(case, gains=gains), its_margins)
     if found is None:

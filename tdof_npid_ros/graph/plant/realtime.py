@@ -77,10 +77,8 @@ class RealtimePlant:
         node, now = self._node, STEADY.now().nanoseconds
         if self.first_tick_ns is None:
             self.first_tick_ns = now - (now - self.due_from_ns) % self.wall_period_ns  # when it was due
-            due_ns = self.ros_time.at(self.first_tick_ns)
-            self.start_ns = max(
-                due_ns, self.latest_stamp_ns + self._port.period_ns
-            )  # each stamp is later than all before
+            after_all_ns = self.latest_stamp_ns + self._port.period_ns
+            self.start_ns = max(self.ros_time.at(self.first_tick_ns), after_all_ns)
             self.latest_tick_ns = now
             self.missed_ticks = 0
         else:

@@ -154,9 +154,9 @@ class RecorderNode(LoopNode):
         if self.failure:
             self._let_go()
             self._tell_failure()
-            return
-        self._look()
-        calm = self.calm_looks >= CALM_LOOKS
+        else:
+            self._look()
+        calm = bool(self.failure) or self.calm_looks >= CALM_LOOKS
         self.discovery.timer_period_ns = round((CALM_DISCOVERY_PERIOD if calm else DISCOVERY_PERIOD) * 1e9)
 
     def _look(self) -> None:
